@@ -7,8 +7,8 @@ import sys
 from typing import Any
 
 # Read by OpenMP when torch loads. Its default lets waiting threads spin: on a busy machine, answering 57 questions on
-# two threads then took 203 s in place of 9 s. Not at all is too little: where threads wait for microseconds, as between
-# the layers of one token, the same 104 answers took 86 s, and 65 s with this many turns.
+# two threads then took 203 s in place of 9 s. A little spinning pays where threads wait for microseconds, as between
+# the layers of one token: 104 answers took 86 s without it, and 65 s with this much.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "10000")
 

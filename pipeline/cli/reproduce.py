@@ -5,10 +5,9 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from pipeline.config.params import load_params
+from pipeline.config.params import CHAIN, load_params
 from pipeline.core.errors import UserError
 
-CHAIN = "dvc.yaml"
 INTERRUPTED = ("exited with 130", "exited with -2")
 """How DVC's error ends for a stage that Ctrl-C ended, the second where it had hardly begun or was at its end."""
 
@@ -28,7 +27,7 @@ def outdated(root: Path) -> tuple[int, int]:
 
     try:
         with Repo(str(root)) as repo:
-            changed, graph = repo.status(targets=[CHAIN]), repo.index.graph
+            changed, graph = repo.status(targets=[str(CHAIN)]), repo.index.graph
     except SCMError:
         raise UserError(f"{root.resolve()}: no Git repository, which DVC needs; clone it, or `git init`") from None
     except DvcException as error:
@@ -36,7 +35,7 @@ def outdated(root: Path) -> tuple[int, int]:
         raise UserError(f"{' '.join(str(error).split())}; {back if 'dvc.lock' in str(error) else 'mend it'}") from None
     started = [stage for stage in graph if stage.addressing in changed]
     waiting = set(started).union(*(nx.ancestors(graph, stage) for stage in started))
-    return len(waiting), sum(stage.path_in_repo == CHAIN for stage in graph)
+    return len(waiting), sum(stage.path_in_repo == str(CHAIN) for stage in graph)
 
 
 def reproduce(root: Path, arguments: list[str]) -> int:

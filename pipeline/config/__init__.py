@@ -42,7 +42,7 @@ PRETRAINED = Path("data/pretrained/encoder.safetensors")
 
 
 class Section(BaseModel):
-    """A frozen part of the configuration; unknown keys are errors, and so are numbers that are none."""
+    """A frozen part of the configuration; unknown keys are errors, and so are NaN and infinity."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -85,10 +85,10 @@ class ScenesConfig(Section):
     objects: tuple[str, ...] = ()
     """Object ids; empty stands for all of the catalogue."""
     videos_per_object: Positive = 5
-    frames: Annotated[int, Field(ge=2, le=1000)] | Literal["recorded"] = 100
-    """Frames a video; `recorded` draws them, and the rate, as often as the public videos have them."""
+    frames: Annotated[int, Field(ge=2, le=1000)] = 100
+    """Frames a video."""
     fps: Annotated[float, Field(gt=0, le=240)] = 25.0
-    """Frames a second, where `frames` is a number."""
+    """Frames a second."""
     tier: Literal["auto", "winkler", "layer", "half_space"] = "auto"
     """How a contact is computed: on springs, with the gel as an elastic layer or as a half-space; `auto` takes what is
     cheapest within `tolerance`."""
@@ -164,7 +164,7 @@ class QuestionsConfig(Section):
     code's, or this project's, which has clearer contrasts. A catalogue's own scenarios are always asked."""
     wording: Literal["object", "class"] = "object"
     """Wording of free descriptions. `object`: each object has one phrase per class, as published. `class`: every object
-    has its class's first phrase, since several split a class's probability in greedy decoding."""
+    has its class's first phrase: with several, greedy decoding splits a class's probability among them."""
     facts: bool = False
     """Begin matching questions with what the named objects are like, for a language model that has never heard of
     them: then no knowledge of the world is asked for. Tables say so."""
@@ -188,7 +188,7 @@ class EncoderConfig(Section):
 
     recipe: Recipe = "paper"
     """`paper`: CLIP with visual prompts, three heads. `release`: the same as the published code has it. `tuned`: a
-    frame classifier on the features of any backbones, then their last stage, or prompts, with it."""
+    frame classifier is fitted to any backbones' features, then trained on with their last stage (CLIP: prompts)."""
     backbone: tuple[str, ...] = Field(default=("clip",), min_length=1)
     """Names in `pipeline.weights.BACKBONES`; of several, features stand side by side. `clip`: a ViT of
     open_clip's. `timm`: a network of timm's. `scenes`: the one that the chain pretrains (section `pretrain`)."""
@@ -248,7 +248,8 @@ class EncoderConfig(Section):
 
 
 class PretrainConfig(Section):
-    """Pretraining of the backbone `scenes` on pictures of invented objects; its layers normalise over whole updates."""
+    """Pretraining of the backbone `scenes` on pictures of invented objects. It has no micro-batches, since batch
+    normalisation needs the whole update."""
 
     objects: Annotated[int, Field(ge=8, le=1_000_000)] = 4000
     """Objects that are invented; each is drawn once."""
@@ -309,8 +310,8 @@ class LanguageConfig(Section):
     generation_batch_size: Positive = 32
 
 
-class Accumulated(Section):
-    """A training whose updates are computed in parts."""
+class TrainConfig(Section):
+    """One stage of language training (AdamW), whose updates are computed in parts."""
 
     batch_size: Positive = 16
     """Items an update, over all devices."""
@@ -318,17 +319,6 @@ class Accumulated(Section):
     """Items per forward pass on a device; gradients accumulate. Changes time, memory and, by rounding, last digits."""
     max_grad_norm: GradNorm = 1.0
     """Clip gradients to this norm; 0 does not clip (the published code)."""
-
-    @model_validator(mode="after")
-    def _batches_divide(self) -> Self:
-        if self.batch_size % self.micro_batch_size:
-            raise ValueError(f"micro_batch_size {self.micro_batch_size} does not divide batch_size {self.batch_size}")
-        return self
-
-
-class TrainConfig(Accumulated):
-    """One stage of language training (AdamW)."""
-
     samples: Positive
     """Questions trained on (paper: 8k for alignment, 3k end to end)."""
     epochs: Positive = 1
@@ -341,6 +331,12 @@ class TrainConfig(Accumulated):
     """Schedule of the projection's learning rate (published code: `constant`); the other rates follow a cosine."""
     warmup_ratio: Annotated[float, Field(ge=0, lt=1)] = 0.0
     weight_decay: Annotated[float, Field(ge=0, lt=1)] = 0.0
+
+    @model_validator(mode="after")
+    def _batches_divide(self) -> Self:
+        if self.batch_size % self.micro_batch_size:
+            raise ValueError(f"micro_batch_size {self.micro_batch_size} does not divide batch_size {self.batch_size}")
+        return self
 
 
 class AlignConfig(TrainConfig):

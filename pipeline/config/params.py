@@ -58,7 +58,7 @@ def main_folder() -> Path:
 
 
 def load_params(path: Path = PARAMS_FILE) -> Params:
-    """Read and check params.yaml; that of this folder only where it is the project's, with its own code."""
+    """Read and check params.yaml; for this folder's, `in_project` must hold."""
     if path == PARAMS_FILE:
         in_project()
     try:

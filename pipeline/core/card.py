@@ -1,6 +1,7 @@
 """The model card beside every trained model: what it is made of, how it was trained and what it cannot do.
 
-It holds facts alone and no score, as none is known when a model has been trained. Equal trainings write equal bytes.
+A training's card has no scores, as none are known then; that of a packaged model has them. Equal trainings write equal
+bytes.
 """
 
 from __future__ import annotations

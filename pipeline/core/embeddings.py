@@ -47,7 +47,7 @@ class Statistics(NamedTuple):
 
 
 class EmbeddingStore:
-    """Embeddings of every salient frame; training videos also in their three mirrored versions.
+    """Embeddings of every kept frame; of training videos also mirrored, where `encoder.flip_probability` is above 0.
 
     Args:
         folder: Where `embed` wrote them; without a folder the store is empty.
@@ -80,17 +80,17 @@ class EmbeddingStore:
         return self.tensor.shape[1]
 
     def count(self, video_id: str) -> int:
-        """Salient frames of a video; a video without any is a UserError."""
+        """Kept frames of a video; a video without any is a UserError."""
         return len(self.rows(video_id))
 
     def rows(self, video_id: str) -> list[int]:
-        """Where the embeddings of a video's salient frames, as they are, stand in the tensor."""
+        """Where the embeddings of a video's kept frames, as they are, stand in the tensor."""
         if (video_id, "none") not in self._rows:
             raise UserError(f"{self.folder / INDEX_FILE}: {video_id} has no embedding; run `dvc repro`")
         return self._rows[video_id, "none"]
 
     def features(self, video_id: str, positions: Sequence[int], flip: Flip = "none") -> torch.Tensor:
-        """Embeddings of the frames at these positions in the list of salient frames: positions x dim."""
+        """Embeddings of the frames at these positions in the list of kept frames: positions x dim."""
         rows = self._rows[video_id, flip]
         return self.tensor[[rows[p] for p in positions]]
 

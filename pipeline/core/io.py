@@ -48,7 +48,7 @@ def atomic(path: Path) -> Iterator[Path]:
 
 def remove_rests(folder: Path) -> None:
     """Remove what killed processes left unfinished anywhere below a folder; nothing else would ever remove it."""
-    for place, folders, files in os.walk(folder):  # Which passes over what vanishes meanwhile.
+    for place, folders, files in os.walk(folder):  # os.walk skips folders that vanish meanwhile.
         for name in (*folders, *files):
             _remove_rest(Path(place, name))
 

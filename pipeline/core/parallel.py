@@ -94,8 +94,8 @@ def run_with(
 
     Args:
         model: Used in this process.
-        source: Loads the same model in a worker; equal sources must have equal hashes. A worker may outlive a stage, so
-            what lies at the same place later must be another source. Without one all is done here.
+        source: Loads the same model in a worker; None: all is done here. It is the key of a worker's cache, so it is
+            hashable, and another one in each run: a worker may outlive a stage.
         work: A function of a module, for workers to import.
     """
     if _chosen == "processes" or source is None:

@@ -71,10 +71,10 @@ class Touch(StrEnum):
 
 
 class Shown(StrEnum):
-    """What a model is shown that the chain did not train."""
+    """What a model that the chain did not train is shown."""
 
     FRAMES = "frames"
-    """The salient frames of the question's videos."""
+    """The kept frames of the question's videos."""
     PHOTOS = "photos"
     """Photos of the question's objects."""
     TOUCH = "touch"
@@ -390,11 +390,17 @@ TENSOR_FILE, INDEX_FILE = "embeddings.safetensors", "index.parquet"
 
 ALL_SEEDS = "all"
 """In place of a seed: the mean over seeds, or over the repeats of a cross-validation."""
-HEADS, VALIDATION_HEADS, RECALL, CROSS_VALIDATION = "heads", "heads_validation", "heads_recall", "cross_validation"
-NEIGHBOURS, ADJECTIVES = "nearest_neighbour", "adjective"
-"""Values of the column `task` in rows that are no task's own accuracy. In this order: the fine-tuned encoder's property
-heads on test and on validation videos, their recall by class, encoders in cross-validation, the class of each test
-video's nearest neighbour, and a task's answers counted again by adjective."""
+# Values of the column `task` in rows that are no task's own accuracy.
+HEADS, VALIDATION_HEADS = "heads", "heads_validation"
+"""The fine-tuned encoder's property heads on test and on validation videos."""
+RECALL = "heads_recall"
+"""Of each class's test videos, the share that the heads put into it."""
+CROSS_VALIDATION = "cross_validation"
+"""Encoders in cross-validation."""
+NEIGHBOURS = "nearest_neighbour"
+"""The class of each test video's nearest neighbour."""
+ADJECTIVES = "adjective"
+"""A task's answers, counted again by adjective."""
 
 
 class ScoreRow(Record):

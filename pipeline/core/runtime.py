@@ -1,4 +1,4 @@
-"""Seeds, devices, number formats (only this decides where a tensor lives), and how far a long run is."""
+"""Seeds, devices, number formats, and how far a long run is."""
 
 from __future__ import annotations
 

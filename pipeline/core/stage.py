@@ -102,9 +102,9 @@ def stage(name: str, key: str | None = None, *, launched: bool = False) -> Itera
             this process ends there.
 
     A UserError, a disk that cannot be read or written, or want of memory ends it with one line and status 1. So does a
-    params.yaml, code or catalogue that was changed meanwhile: DVC would record the new for what the old made. Metrics,
-    time, memory go to runs/, which is nobody's input, so that results stay identical from run to run; tracking shows
-    them.
+    change of params.yaml, code or catalogue while it runs: DVC would take the new files for what the outputs were made
+    from. Metrics, time and memory go to runs/, where tracking reads them. No stage depends on that, so results stay
+    identical from run to run.
     """
     started = time.time()
     full = f"{name}@{key}" if key else name
@@ -131,7 +131,9 @@ def stage(name: str, key: str | None = None, *, launched: bool = False) -> Itera
             changed += [PARAMS_FILE] if load_params() != params else []
             if changed:
                 file = os.path.relpath(min(changed))
-                raise UserError(f"{file} was changed while it ran; what it made fits the old one, so run it again")
+                raise UserError(
+                    f"{file} was changed while it ran; the outputs come from the old version, so run the stage again"
+                )
             if _main_process():
                 _write_run(running)
                 shutil.rmtree(CHECKPOINTS / full, ignore_errors=True)

@@ -47,7 +47,7 @@ from pipeline.videos.catalogue import Catalogue
 
 
 class Setting(NamedTuple):
-    """What was asked, apart from the seed."""
+    """Who answered, and from what touch, apart from the seed."""
 
     encoder: Encoder
     lora: Lora | None
@@ -88,7 +88,7 @@ class Answer(NamedTuple):
 Runs = Mapping[int, Mapping[str, Answer]]
 """By seed and question."""
 Table = Mapping[tuple[str, str], Mapping[Setting, Runs]]
-"""By measure, setting, seed and question."""
+"""By task and measure, then setting, seed and question."""
 
 
 def score_rows(

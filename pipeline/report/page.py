@@ -34,7 +34,7 @@ AUDIT = ("check", "item", "measured", "expected", "severity")
 BESIDE = {
     "encoder_errors": (
         "How far encoders are off",
-        "Classes are ordinal: classes that an answer is off on average, and Cohen's quadratically weighted kappa.",
+        "By how many classes predictions are off on average, and Cohen's quadratically weighted kappa.",
     ),
     "calibration": (
         "Calibration of the heads' probabilities",

@@ -40,7 +40,7 @@ ADAM = 3 * FULL
 GATHERED = 2
 """Layers whose weights a sharded training holds whole: the one that computes and the one that is fetched."""
 READ_TOGETHER = ({"q_proj", "k_proj", "v_proj"}, {"gate_proj", "up_proj"}, {"down_proj"})
-"""Linear maps that read one tensor, which a frozen layer does not keep; what `o_proj` reads, attention keeps anyway."""
+"""Linear maps that read the same tensor, kept only for an adapter. What `o_proj` reads, attention keeps anyway."""
 ASKED = 30
 """Questions of each task among which the longest conversation is looked for."""
 LETTERS = 4
@@ -125,7 +125,7 @@ def read_shapes(params: Params) -> Shapes:
 
 
 def count(params: Params, shapes: Shapes) -> list[Use]:
-    """The memory of all stages that run a base model whose shapes are known: of the encoder's, those by gradients."""
+    """The memory of each stage that runs a base model of known shapes; `finetune_encoder` with prompts alone."""
     uses, config, tower = list[Use](), params.encoder, shapes.tower
     if tower is not None:
         width, depth = tower.transformer.width, len(layers(tower))

@@ -2,9 +2,9 @@
 
 Three models ("tiers"): springs (`winkler`), and elastic bodies whose pressures are solved for, the gel a layer bonded
 to its window (`layer`) or a half-space (`half_space`). The elastic ones work in two scales: a grid of `cells` across
-the patch carries the body and its larger bumps; what is too fine for it is pressed in where and as far as the
-pressure flattens it, by the contact share of a rough surface, erf(sqrt(2) p / (E* h')), with the root mean square
-slope h' of the fine part (Persson 2001, J. Chem. Phys. 115).
+the patch carries the body and its larger bumps. Of what is finer, a pressure p flattens the share
+erf(sqrt(2) p / (E* h')), where h' is the root mean square slope of that fine part (the contact share of a rough
+surface: Persson 2001, J. Chem. Phys. 115).
 
 The gel is uniform, so a contact depends on the force and not on its place or rotation. A body is therefore pressed at a
 few forces once a video, and frames are interpolated between these.
@@ -194,11 +194,11 @@ def press_by(
         return Pressed(sinks, areas, residual)
     fine = heights - _enlarge(coarse, side)
     together = series(GEL.modulus, modulus)
-    # The share of the fine part that the pressure flattens, and of this the gel's part, not the object's.
-    flattened = math.sqrt(2) / (together * max(_rms_slope(fine, pitch), 1e-9))
-    share = np.float32(together / GEL.modulus) * fine
+    # erf's argument for each MPa of pressure, and the gel's part of the fine relief once it is pressed flat.
+    per_pressure = math.sqrt(2) / (together * max(_rms_slope(fine, pitch), 1e-9))
+    gels_part = np.float32(together / GEL.modulus) * fine
     skins = [
-        _enlarge(sink, side) + share * erf(np.float32(flattened) * _enlarge(pressure, side))
+        _enlarge(sink, side) + gels_part * erf(np.float32(per_pressure) * _enlarge(pressure, side))
         for sink, pressure in zip(sinks, solution.pressure, strict=True)
     ]
     return Pressed(np.stack(skins), areas, residual)

@@ -36,11 +36,11 @@ TEXTURE: tuple[Range, ...] = (
     (ROUGH_MM[0] * 1.5, ROUGH_MM[1] / 1.5),
     (ROUGH_MM[1] * 1.5, math.inf),
 )
-"""Root mean square height of the texture by roughness, in mm: half as much again away from each border."""
+"""Root mean square height of the texture by roughness, in mm: a factor of 1.5 away from each border."""
 BUMPS: tuple[Range, ...] = ((0.0, 0.0), (0.02, BIG_SHARE / 1.25), (BIG_SHARE * 1.25, 1.0))
-"""Width of the bumps by bumpiness, as a share of the image's height: a quarter away from the border."""
+"""Width of the bumps by bumpiness, as a share of the image's height: a factor of 1.25 away from the border."""
 WIDTHS_MM: tuple[Range, ...] = ((0.0, math.inf), (0.7, 4.5), (3.0, math.inf))
-"""Width of the widest layer of relief, by bumpiness; nothing outside measures as this class, so it is not pressed."""
+"""Widest feature of relief by bumpiness, in mm. Outside it no object measures as the class, so none is pressed."""
 ACROSS = {"plates": "size", "weave": "spacing", "creases": "spacing", "digits": "stroke"}
 """By kind of layer, the key for the width of a feature where it is not `width`; roughness has no width."""
 FORCES_N = (1.0, 3.0)

@@ -58,7 +58,7 @@ the three differences to the reference are, but for noise, linear in two slopes,
 the true one is the gradient of something, that is, without curl. That leaves their size, by assumption equal over the
 picture; the absolute one is that of the egg, whose radius is known (22 mm), to about 20 %."""
 DIRECT = 0.9
-"""D as a share of the background. The darkest that red gets in 1e-5 of the places is .14 of it."""
+"""D as a share of the background: without it a tenth remains. The darkest 1e-5 of red pixels measured .14."""
 TINT, SHIFT, STRENGTH = 0.015, 0.02, 0.05
 """Deviations between sensors: of each channel's brightness, of the light's centre (in half pictures), and of the gains;
 the first two from four sensors told apart by their dust, the last a guess."""
@@ -146,7 +146,7 @@ def shade(skin: Heights, sensor: Sensor, pitch: float, seed: int, drift: Drift |
     picture += sensor.glow
     dust = sensor.dust
     if drift is not None:
-        # Where the paint has carried it; drift is smooth, so where a grain came from has moved about as far.
+        # A grain seen here came from here minus its drift. The drift is smooth, so it is read here and not there.
         x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
         from_x, from_y = x - drift[0] / np.float32(pitch), y - drift[1] / np.float32(pitch)
         # Beyond the picture there is no dust: all light passes.

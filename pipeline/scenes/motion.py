@@ -16,10 +16,6 @@ import numpy.typing as npt
 
 Track = npt.NDArray[np.float64]
 
-RECORDED = ((126, 25.0), (50, 10.0))
-"""Frames and frames a second of the public videos, five seconds each; 366 of the 370 of no test object have these."""
-SLOW_SHARE = 0.18
-"""Share of the videos at 10 frames a second."""
 FORCE_N = (0.5, 4.0)
 """Range of the peak force. Not measured, but such that frames differ from the reference as much as real ones do."""
 QUANTILES = (0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95)
@@ -65,11 +61,6 @@ class Motion:
     x: Track
     """Place of the object's centre in mm, from the image's centre."""
     y: Track
-
-
-def draw_length(rng: np.random.Generator) -> tuple[int, float]:
-    """Frames and frames a second of a video, as often as they were recorded."""
-    return RECORDED[int(rng.random() < SLOW_SHARE)]
 
 
 def make_motion(frames: int, rng: np.random.Generator, *, twist: bool = True) -> Motion:

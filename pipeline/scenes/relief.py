@@ -243,7 +243,7 @@ class Domes(Record):
     occupied: Share = 1.0
     """Share of the lattice's places that bear a bump."""
     uneven: Share = 0.2
-    """By which share heights differ."""
+    """By up to which share a bump is lower than `height`."""
 
     def sample(self, grid: Grid, rng: np.random.Generator) -> Heights:
         """One bump after the other, each into the few pixels that it covers."""

@@ -94,6 +94,6 @@ def place(patch: Heights, angle: float, centre: Sequence[float], size: tuple[int
     middle = (patch.shape[0] - 1) / 2
     turn = cv2.getRotationMatrix2D((middle, middle), angle, 1.0)
     turn[:, 2] += (centre[0] - middle, centre[1] - middle)
-    # Cubic would ripple on slopes; the skin is smooth on the scale of a pixel where it is far from one.
+    # Cubic would ripple on slopes; away from them the skin hardly changes within a pixel.
     shown: Heights = cv2.warpAffine(patch, turn, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return shown

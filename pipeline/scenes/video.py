@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import cv2
-import numpy as np
 
 from pipeline.config import ScenesConfig
 from pipeline.core.errors import UserError
@@ -18,7 +17,6 @@ from pipeline.core.parallel import run_parallel
 from pipeline.core.records import Record
 from pipeline.core.runtime import derive_seed
 from pipeline.scenes.light import make_sensor
-from pipeline.scenes.motion import draw_length
 from pipeline.scenes.recipe import Recipe
 from pipeline.scenes.render import make_scene, measure_scene, render
 from pipeline.videos.catalogue import Catalogue
@@ -101,18 +99,15 @@ class _Job(NamedTuple):
 
 def _write(staging: Path, config: ScenesConfig, job: _Job) -> SceneRow:
     recipe, seed = job.recipe, derive_seed(config.seed, job.object_id, job.number)
-    frames, fps = config.frames, config.fps
-    if frames == "recorded":
-        frames, fps = draw_length(np.random.default_rng(derive_seed(seed, "length")))
     sensor = make_sensor(config.width, config.height, derive_seed(config.seed, "sensor", seed % SENSORS))
-    scene = make_scene(recipe, config, frames, seed)
-    write_film(staging / str(job), render(scene, config, sensor, seed), fps)
+    scene = make_scene(recipe, config, config.frames, seed)
+    write_film(staging / str(job), render(scene, config, sensor, seed), config.fps)
     imprint, measured = scene.imprint, measure_scene(scene, recipe, config)
     return SceneRow(
         video=str(job),
         object_id=job.object_id,
-        frames=frames,
-        fps=fps,
+        frames=config.frames,
+        fps=config.fps,
         force=round(imprint.force, 4),
         method=str(imprint.method),
         error=None if imprint.error is None else round(imprint.error, 4),

@@ -90,7 +90,7 @@ class TaskDefinition(ABC):
 
     @abstractmethod
     def strata(self, catalogue: Catalogue) -> int:
-        """How many kinds of question are balanced: question i of a set asks for stratum i modulo this number."""
+        """How many kinds of question there are; a set takes them by turns, so that they are balanced."""
 
     @abstractmethod
     def draft(self, pool: Pool, stratum: int, rng: random.Random) -> Draft | None:

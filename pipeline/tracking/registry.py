@@ -42,7 +42,7 @@ def log_model(client: Any, run: str, params: Params, variant: Variant, folder: P
     with mlflow.start_run(run, log_system_metrics=False), TemporaryDirectory() as temporary:
         # Where DVC's cache hands out links, MLflow refuses them: they lead out of the folder.
         real = shutil.copytree(folder, Path(temporary, folder.name))
-        # The model that is shipped is no code of this one.
+        # The shipped model lies among the code, but is none.
         aside = shutil.ignore_patterns("pretrained", "__pycache__")
         code = shutil.copytree(PACKAGE, Path(temporary, PACKAGE.name), ignore=aside)
         mlflow.pyfunc.log_model(

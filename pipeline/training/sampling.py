@@ -27,6 +27,6 @@ T = TypeVar("T", covariant=True)
 
 
 class EpochDataset(Dataset[T], Generic[T]):
-    """A dataset that draws anew in each epoch; `TrainableTrainer` sets which one it is."""
+    """A dataset that draws anew in each epoch; `TrainingMonitor` sets which one it is."""
 
     epoch = 0

@@ -24,7 +24,7 @@ from transformers.trainer import SCHEDULER_NAME, TRAINER_STATE_NAME, TRAINING_AR
 from transformers.trainer_utils import get_last_checkpoint
 from transformers.utils import SAFE_WEIGHTS_NAME
 
-from pipeline.config import Accumulated, EncoderConfig, PretrainConfig, RuntimeConfig
+from pipeline.config import EncoderConfig, PretrainConfig, RuntimeConfig, TrainConfig
 from pipeline.core.errors import UserError
 from pipeline.core.io import code_of, fingerprint
 from pipeline.core.records import Measurement
@@ -133,7 +133,7 @@ def check_finite(values: Mapping[str, torch.Tensor], step: int) -> None:
 
 
 class TrainingMonitor(TrainerCallback):
-    """Says in a log file how far a training is, and stops it where the loss is no number any more."""
+    """Sets the data set's epoch, logs how far a training is, and stops it where loss or gradient is not finite."""
 
     _lines: LogLines | None = None
 
@@ -190,7 +190,7 @@ def check_accelerate() -> None:
 
 
 def training_arguments(
-    folder: Path, runtime: RuntimeConfig, seed: int, config: Accumulated | EncoderConfig | PretrainConfig, **own: Any
+    folder: Path, runtime: RuntimeConfig, seed: int, config: TrainConfig | EncoderConfig | PretrainConfig, **own: Any
 ) -> TrainingArguments:
     """What all trainings share: AdamW, a cosine, checkpoints every `runtime.save_steps`; `own` adds and overrides.
 

@@ -69,7 +69,7 @@ class Comparison(Record):
     choice: Literal["yes", "no", "same"] | None
     """None where the answer cannot be read."""
     notes: tuple[str, ...]
-    """What should make one doubt it, behind the name of a video."""
+    """What should make one doubt it: of the model, then of each video, after its name."""
 
 
 class Ranking(Record):

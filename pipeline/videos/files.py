@@ -29,7 +29,7 @@ PASSED = "passed over"
 
 @dataclass(frozen=True)
 class VideoFile:
-    """A file that says which sample it is."""
+    """A video file: which video of which object it is."""
 
     path: Path
     relative: str

@@ -285,7 +285,7 @@ def read_state(file: Path, key: str, trusted: bool) -> dict[str, torch.Tensor]:
 
 
 def copy(source: Path, target: Path, *endings: str) -> None:
-    """Copy files of these endings; hidden ones and what says of a pickle or of sums stays."""
+    """Copy files of these endings, but no hidden file, list of hashes or index of pickled shards."""
     for file in source.iterdir():
         odd = file.name.startswith(".") or file.name == SUMS or file.name.endswith(".bin.index.json")
         if file.is_file() and file.suffix in endings and not odd:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.scenes import motion
-from pipeline.scenes.motion import FORCE_N, RECORDED, SLOW_SHARE, TWIST_DEGREES, draw_length, make_motion
+from pipeline.scenes.motion import FORCE_N, TWIST_DEGREES, make_motion
 
 MEDIAN = 3
 
@@ -56,10 +56,3 @@ def test_the_force_falls_while_the_hand_twists() -> None:
     hand = make_motion(1000, np.random.default_rng(3))
     turning = np.flatnonzero(np.diff(hand.angle))
     assert (np.diff(hand.force)[turning] <= 1e-12).all()
-
-
-def test_lengths_are_drawn_as_recorded() -> None:
-    rng = np.random.default_rng(0)
-    drawn = [draw_length(rng) for _ in range(2000)]
-    assert set(drawn) == set(RECORDED)
-    assert drawn.count(RECORDED[1]) / 2000 == pytest.approx(SLOW_SHARE, abs=0.03)

@@ -12,7 +12,6 @@ from pipeline.scenes import video
 from pipeline.scenes.contact import GEL
 from pipeline.scenes.geometry import IMAGE_MM, Round
 from pipeline.scenes.light import make_sensor
-from pipeline.scenes.motion import RECORDED
 from pipeline.scenes.recipe import Recipe, load_recipes
 from pipeline.scenes.render import make_scene, render
 from pipeline.scenes.video import share_as_labelled, synthesize
@@ -75,13 +74,11 @@ def in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("in_turn")
-@pytest.mark.parametrize("frames", [8, "recorded"])
 def test_files_are_equal_for_equal_seeds_and_as_their_rows_say(
-    recipes: dict[str, Recipe], catalogue: Catalogue, tmp_path: Path, frames: int | str
+    recipes: dict[str, Recipe], catalogue: Catalogue, tmp_path: Path
 ) -> None:
     folders = [tmp_path / "a b", tmp_path / "c"]
-    config = SMALL.model_copy(update={"frames": frames})
-    rows, again = (synthesize(recipes, config, folder) for folder in folders)
+    rows, again = (synthesize(recipes, SMALL.model_copy(update={"fps": 10.0}), folder) for folder in folders)
     assert rows == again
     first, second = ({f.name: f.read_bytes() for f in folder.iterdir()} for folder in folders)
     assert first == second
@@ -89,8 +86,8 @@ def test_files_are_equal_for_equal_seeds_and_as_their_rows_say(
     assert first["rug_0.mp4"] != first["rug_1.mp4"], "each video has its own patch, motion and noise"
     for row, file in zip(rows, list_videos(folders[0], catalogue).files, strict=True):
         probe = scanned(file.path).probe
-        assert (probe.frames, probe.width, probe.height, probe.fps) == (row.frames, 64, 48, row.fps)
-        assert (row.frames, row.fps) in ([(8, 25.0)] if frames == 8 else RECORDED)
+        assert (probe.frames, probe.width, probe.height, probe.fps) == (SMALL.frames, 64, 48, 10.0)
+        assert (row.frames, row.fps) == (SMALL.frames, 10.0)
 
 
 @pytest.mark.usefixtures("in_turn")

@@ -1,4 +1,4 @@
-"""Checks of the labels: recomputed from the ratings, beside what the publishers state, print and write of them."""
+"""Checks of the labels: the ratings against what the publishers state, print and describe; classes of the splits."""
 
 from __future__ import annotations
 

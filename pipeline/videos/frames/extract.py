@@ -39,7 +39,7 @@ class Extraction:
 
 
 class _Done(Record):
-    """A finished video, as it stands in the header of its file in `partial`, beside `reference` and `frames`."""
+    """What was found in a finished video: the metadata of its file, whose tensors are `reference` and `frames`."""
 
     stamp: str
     """Tells whether the file, or what videos.csv says of it, has changed since (`_stamp`)."""

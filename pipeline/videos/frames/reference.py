@@ -53,7 +53,7 @@ def unsteady_frames(thumbs: Iterable[Image], frames: int) -> int:
 def is_steady(thumbs: Sequence[Image]) -> bool:
     """Whether frames have the light of the last one (`UNSTEADY`), by their thumbnails."""
     for thumb in thumbs[:-1]:
-        # Three quarters of a picture are brighter, or darker, by more than a value where a quartile is beyond it.
+        # A lower quartile above the limit means that three quarters are brighter; an upper one below minus it, darker.
         low, high = np.quantile(thumb.astype(np.int16) - thumbs[-1], (0.25, 0.75), axis=(0, 1))
         if max(low.max(), -high.min()) > UNSTEADY:
             return False

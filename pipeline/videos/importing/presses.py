@@ -190,7 +190,7 @@ def film(path: Path, fps: float = 0.0, begin: float = 0.0, end: float | None = N
         pictures = ((f"{path}, frame {number}", frame) for number, frame in enumerate(decode(path)))
     if rate <= 0:
         raise UserError(f"{path}: its frames a second are not known; say --fps, or name a video")
-    if not RATES[0] <= rate <= RATES[1]:  # Nor a number that is none.
+    if not RATES[0] <= rate <= RATES[1]:  # NaN fails this, too.
         raise UserError(f"{path}: {rate:g} frames a second; --fps takes {RATES[0]:g} to {RATES[1]:g}")
     size = None
     for number, (where, picture) in enumerate(pictures):
