@@ -31,4 +31,5 @@ if __name__ == "__main__":
         predictions = cross_validate_model(name, training, params.cross_validation)
         write_table(DATA / "cross_validation" / name / "out_of_fold.parquet", OutOfFold, predictions)
         right = [p.expected == p.predicted for p in predictions]
-        run.metrics["combined.accuracy"] = sum(right) / len(right)
+        if right:  # Of a model that asks for more objects than there are, nothing is predicted.
+            run.metrics["combined.accuracy"] = sum(right) / len(right)

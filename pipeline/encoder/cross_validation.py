@@ -6,6 +6,7 @@ also with few training objects, which says what a new sensor needs.
 
 from __future__ import annotations
 
+import logging
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -25,6 +26,8 @@ from pipeline.encoder.frame_classifier import choose_strength, fit_frame_heads
 from pipeline.encoder.model import SideBySide, load_backbones
 from pipeline.encoder.tuned import Trunks, base_encoder, run_trunks
 
+logger = logging.getLogger(__name__)
+
 VALIDATION = 8
 """One in so many training objects is set aside where a training chooses its best epoch."""
 
@@ -34,7 +37,8 @@ def cross_validate_model(name: str, training: Training, config: CrossValidationC
 
     All videos of `training` are in the part UNUSED, as each fold sets parts of its own. Folds depend on the objects and
     `config` alone, so all models share them. `name` is one of `MODELS`, or with a number behind it as
-    `cross_validation.models` has it. Fewer objects than folds are a UserError.
+    `cross_validation.models` has it; a number that a fold's training objects do not reach gives no predictions, as the
+    model would be another than its name says. Fewer objects than folds are a UserError.
     """
     data, (owners, labels) = training.data, _videos(training.data)
     objects = len(set(owners.tolist()))
@@ -42,10 +46,13 @@ def cross_validate_model(name: str, training: Training, config: CrossValidationC
         raise UserError(
             f"cross_validation.folds is {config.folds} but only {objects} objects have videos; lower it, to 2 at least"
         )
+    (kind, fewer), fewest = kind_of(name), objects - -(-objects // config.folds)
+    if fewer and fewer > fewest:
+        logger.warning("%s: left out, as a fold has only %d training objects", name, fewest)
+        return []
     labelled = repr([(a.video_id, data.catalogue.labels(a.object_id)) for a in data.assignments])
     settings = (name, config.model_copy(update={"models": ()}), training.config, data.per_video, labelled)
     work = CHECKPOINTS / "cross_validation" / fingerprint(*settings, *training.inputs, *code_of("cross_validate"))
-    kind, fewer = kind_of(name)
     predict = MODELS[kind](training)
     with progress(config.folds * config.repeats, "cross-validation", "fold") as advance:
 

@@ -150,8 +150,10 @@ def test_constant_by_hand(training: Training) -> None:
     assert len({r.predicted for r in found}) > 1, "folds differ here"
 
 
-def test_with_fewer_objects_more_contain_fewer(training: Training, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A number behind a model's name is how many objects it learns from, and nothing else changes."""
+def test_with_fewer_objects_more_contain_fewer(
+    training: Training, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A number behind a model's name is how many objects it learns from, or it says nothing; nothing else changes."""
     owners = np.array([a.object_id for a in training.data.assignments])
     learnt: list[set[str]] = []
 
@@ -163,8 +165,10 @@ def test_with_fewer_objects_more_contain_fewer(training: Training, monkeypatch: 
 
         return predict
 
-    whole = cross_validate_model("constant", training, CONFIG)
-    assert cross_validate_model("constant-9", training, CONFIG) == whole, "a fold has fewer"
+    assert len(cross_validate_model("constant-4", training, CONFIG)) == 2 * len(owners)
+    assert not caplog.text
+    assert cross_validate_model("constant-5", training, CONFIG) == [], "of 7 objects, one fold tests three"
+    assert "constant-5: left out, as a fold has only 4 training objects" in caplog.text
     monkeypatch.setitem(module.MODELS, "constant", noting)
     for name in ("constant-1", "constant-3", "constant"):
         cross_validate_model(name, training, CONFIG)
