@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,6 +20,8 @@ from pipeline.tasks.questions import build_questions, counts_by_task
 from pipeline.use.model import Octopi
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 
+logger = logging.getLogger(__name__)
+
 BATCH = 64
 """Answers in a batch; their keys and values take a gigabyte. Each step reads all weights once, however many answers
 share it."""
@@ -28,13 +31,20 @@ def answers_about(octopi: Octopi, params: Params, videos: Sequence[Video]) -> li
     """Ask `params.shipped` questions about the videos, and grade the answers and what follows by rule from the heads.
 
     Real videos are asked about twice: as they are, and standardised by their own mean and deviation, which takes no
-    label. Another sensor shifts and scales embeddings.
+    label. Another sensor shifts and scales embeddings. A model of other properties or classes is asked nothing, since
+    it has no words for these.
 
     Raises:
         UserError: for an object that the model was trained on, or a video that it cannot use.
     """
     catalogue = load_catalogue(Path(params.data.catalogue)).asking(params.questions.scenarios)
     catalogue = catalogue.called("number" if octopi.numbered else "catalogue")
+    known, wanted = (
+        "; ".join(f"{p.name}: {', '.join(p.levels)}" for p in c.properties) for c in (octopi.catalogue, catalogue)
+    )
+    if known != wanted:
+        logger.warning("%s is not asked: it knows %s, but %s has %s", octopi.name, known, params.data.catalogue, wanted)
+        return []
     of_object: dict[str, list[str]] = {}
     for video in videos:
         of_object.setdefault(video.object_id, []).append(video.video_id)

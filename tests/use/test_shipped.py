@@ -8,6 +8,8 @@ from collections import Counter
 from collections.abc import Iterator
 from hashlib import sha256
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 import torch
@@ -27,6 +29,8 @@ from pipeline.use import folder
 from pipeline.use.adapt import adapt
 from pipeline.use.folder import SHIPPED, Base, find_base, read_folder
 from pipeline.use.model import Octopi
+from pipeline.use.shipped import answers_about
+from pipeline.videos.catalogue import Catalogue
 from tests.checkpoints import edit
 from tests.closure import ROOT
 from tests.conftest import fake_videos, refused
@@ -165,6 +169,18 @@ def test_a_runs_videos_are_asked_about_as_they_are_and_standardised(
             assert f" {row.predicted} " in said[row.objects[0]].sentence
     with pytest.raises(SystemExit, match=r"octopi-small knows object_\S+, so it is not asked; set shipped to 0"):
         run({next(iter(octopi.catalogue.objects)): "soft"})
+
+
+@pytest.mark.parametrize("update", [{"name": "warmth"}, {"levels": ("yielding", "springy", "rigid")}])
+def test_it_is_not_asked_about_properties_or_classes_of_others(
+    update: dict[str, Any], catalogue: Catalogue, caplog: pytest.LogCaptureFixture
+) -> None:
+    first, *rest = catalogue.properties
+    known = SimpleNamespace(properties=(first.model_copy(update=update), *rest))
+    model = SimpleNamespace(catalogue=known, numbered=True, name="octopi-small")
+    params = compose("smoke", ["shipped=4", f"data.catalogue={ROOT}/pipeline/physiclear"], ROOT / "conf")
+    assert answers_about(cast(Octopi, model), params, fake_videos(["rug"])) == []
+    assert re.search(r"octopi-small is not asked: .*(warmth: soft|yielding).*, but .*hardness: soft", caplog.text)
 
 
 @pytest.mark.slow
