@@ -5,10 +5,12 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Callable, Sequence
+from fractions import Fraction
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -261,6 +263,23 @@ def test_a_long_video_and_a_folder_of_pictures_are_cut_as_a_bag_is(tmp_path: Pat
         (text, ["--fps", "25"], "no frame decodes"),
     ):
         assert re.match(f"refused: .*{re.escape(words)}", imported(*command, source, *options))
+
+
+def test_a_video_of_varying_rate_is_cut_by_its_time_stamps(tmp_path: Path) -> None:
+    """Two seconds at 25 a second show black, two at 10 a second white."""
+    with av.open(str(tmp_path / "phone.mp4"), "w") as container:
+        stream = container.add_stream("mpeg4", rate=50, width=64, height=48)
+        stream.codec_context.time_base = Fraction(1, 50)
+        for at in (*range(0, 100, 2), *range(100, 200, 5)):
+            frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 255 * (at >= 100), np.uint8), format="bgr24")
+            frame.pts, frame.time_base = at, Fraction(1, 50)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    (tmp_path / "videos.csv").write_text("file,object_id,begin,end\nphone.mp4,rug,,2\nphone.mp4,rug,2,\n")
+    imported("video", tmp_path / "videos.csv", "--out", tmp_path / "cut")
+    black, white = ([p.mean() for p in decode(tmp_path / "cut" / f"rug_{n}.mp4")] for n in (0, 1))
+    assert (len(black), len(white)) == (50, 20)
+    assert max(black) < 40 < 215 < min(white)
 
 
 def test_a_table_says_where_to_cut(tmp_path: Path, pictures: list[np.ndarray], catalogue: Catalogue) -> None:

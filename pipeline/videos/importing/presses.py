@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import av
 import cv2
@@ -23,9 +24,10 @@ from scipy import ndimage
 from pipeline.core.errors import UserError
 from pipeline.core.io import remove_rests, write_csv
 from pipeline.core.records import Record
+from pipeline.videos import decoding
 from pipeline.videos.audit.files import FOUND
 from pipeline.videos.catalogue.csv_reader import read_rows
-from pipeline.videos.decoding import Decoder, Image, decode
+from pipeline.videos.decoding import Decoder, Image
 from pipeline.videos.files import LIST_FILE, SECTION, is_video
 from pipeline.videos.film import write_film
 from pipeline.videos.frames.reference import (
@@ -174,7 +176,8 @@ def _seconds(where: str, column: str, text: str) -> float | None:
 def film(path: Path, fps: float = 0.0, begin: float = 0.0, end: float | None = None) -> Iterator[Shot]:
     """The pictures of a video, or of a folder of PNG or JPEG files by their names (2 before 10).
 
-    From `begin` to `end`, in seconds, at `fps` pictures a second; 0 is the video's own rate, and a folder has none.
+    From `begin` to `end`, in seconds, at `fps` pictures a second; with 0 a video's pictures are at their own time
+    stamps, since telephones record at a rate that varies, and a folder has none.
     UserError where there is no picture, one cannot be read or has another size, or the rate is unknown.
     """
     if not path.exists():
@@ -183,23 +186,24 @@ def film(path: Path, fps: float = 0.0, begin: float = 0.0, end: float | None = N
     if path.is_dir():
         files = [file for file in path.iterdir() if file.suffix.lower() in PICTURES]
         files.sort(key=lambda file: [int(word) if word.isdecimal() else word for word in re.split(r"(\d+)", file.name)])
-        pictures = ((str(file), cv2.imread(str(file))) for file in files)
+        pictures: Iterator[tuple[str, Any, float | None]] = ((str(f), cv2.imread(str(f)), None) for f in files)
     else:
         with Decoder(path) as decoder:
             rate = rate or decoder.header.fps
-        pictures = ((f"{path}, frame {number}", frame) for number, frame in enumerate(decode(path)))
+        pictures = _stamped(path)
     if rate <= 0:
         raise UserError(f"{path}: its frames a second are not known; say --fps, or name a video")
     if not RATES[0] <= rate <= RATES[1]:  # NaN fails this, too.
         raise UserError(f"{path}: {rate:g} frames a second; --fps takes {RATES[0]:g} to {RATES[1]:g}")
-    size = None
-    for number, (where, picture) in enumerate(pictures):
+    size = first = None
+    for number, (where, picture, stamp) in enumerate(pictures):
         if picture is None:
             raise UserError(f"{where}: no picture that OpenCV reads; copy it again, or remove it")
         size = size or picture.shape
         if picture.shape != size:
             raise UserError(f"{where}: of another size than the first picture; record them in one size")
-        at = round(number * 1e9 / rate)
+        first = stamp if number == 0 else first
+        at = round(1e9 * (number / rate if fps or stamp is None or first is None else stamp - first))
         if end is not None and at >= end * 1e9:
             return
         if at >= begin * 1e9:
@@ -207,6 +211,13 @@ def film(path: Path, fps: float = 0.0, begin: float = 0.0, end: float | None = N
     if size is None:
         what = f"no picture ({', '.join(PICTURES)}) in it" if path.is_dir() else "no frame decodes"
         raise UserError(f"{path}: {what}; name a video or a folder of pictures")
+
+
+def _stamped(path: Path) -> Iterator[tuple[str, Image, float | None]]:
+    """The pictures of a video, each with its name and its time stamp in seconds."""
+    with Decoder(path) as decoder:
+        for number, frame in enumerate(decoder.frames()):
+            yield f"{path}, frame {number}", decoding.picture(frame), frame.time
 
 
 def presses(strengths: npt.NDArray[np.float64], times: float = FOUND) -> list[tuple[int, int]]:
