@@ -171,11 +171,19 @@ def test_training_goes_on_from_a_trained_model(held: Material, checkpoints: Path
     assert {name.split(".")[0] for name in changed} == {"connector"}
     with refused("lora.rank: the adapter to train on has 4; set lora.rank=4"):
         add_lora(model, CONFIG.model_copy(update={"rank": 8}))
+    with refused(r"lora.target_modules: the adapter to train on has \[k_proj,q_proj\]; set lora.target_modules=\["):
+        add_lora(model, CONFIG.model_copy(update={"target_modules": "all-linear"}))
     add_lora(model, CONFIG)
     fit(model, data, CONFIG, CPU, Job("lora", "x", 0))
     after = {name for name, value in model.named_parameters() if not torch.equal(before[name], value)}
     assert {name for name in before if "lora_" in name} <= after
     assert not {name for name in after if name.startswith("llm") and "lora_" not in name}
+    everywhere = CONFIG.model_copy(update={"target_modules": "all-linear"})
+    adapted(assemble(held, CONFIG, "test")[0], everywhere).save_pretrained(tmp_path / "begun" / "language")
+    model, _ = assemble(went_on, CONFIG, "lora")
+    add_lora(model, everywhere)
+    with refused("lora.target_modules: the adapter to train on has all-linear"):
+        add_lora(model, CONFIG)
     other = replace(went_on, store=write_store(tmp_path / "other", [("a_0", 0, "none")], torch.zeros(1, DIM + 1)))
     with refused(f"begun reads embeddings of {DIM}, but the encoder gives {DIM + 1}; set encoder.backbone"):
         assemble(other, CONFIG, "align")
