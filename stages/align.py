@@ -2,10 +2,11 @@
 
 import shutil
 
-from pipeline.core.io import write_table
-from pipeline.core.records import Encoder, Measurement, Opd
+from pipeline.core.io import read_table, write_json, write_table
+from pipeline.core.records import Assignment, Encoder, Measurement, Opd
 from pipeline.core.stage import DATA, matrix_key, stage
 from pipeline.tracking.live import live
+from pipeline.weights import OBJECTS_FILE, objects_met
 
 if __name__ == "__main__":
     encoder, opd, seed = matrix_key(encoder=Encoder, opd=Opd, seed=None)
@@ -16,6 +17,8 @@ if __name__ == "__main__":
         from pipeline.language.words import begin_with_words
 
         config = run.params.align
+        assigned = read_table(DATA / "splits" / f"{seed}.parquet", Assignment)
+        met = objects_met(run.params.language.start, {a.object_id: a.part for a in assigned})
         material = Material.load(DATA, run.params, encoder, opd, seed)
         model, data = assemble(material, config, "align")
         if config.begin_with_words and material.per_video and not run.params.language.start:
@@ -31,5 +34,6 @@ if __name__ == "__main__":
         if material.adapter:
             # Alignment does not change the adapter, so it is not in `trained.state` and is copied.
             shutil.copytree(material.adapter, out / ADAPTER_DIR, dirs_exist_ok=True)
+        write_json(out / OBJECTS_FILE, met)
         write_table(out / "history.parquet", Measurement, trained.history)
         write_model_card(out, material, data, config)

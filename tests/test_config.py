@@ -12,8 +12,12 @@ from pydantic import ValidationError
 from pipeline.config import TrackingConfig
 from pipeline.config.params import load_params
 from pipeline.core.errors import UserError, without_secrets
+from pipeline.core.io import write_json
 from pipeline.encoder.recipes import RECIPES
 from pipeline.scales import check_inputs, compose, prune, shipped_scales, write_params
+from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.split import assign_objects
+from pipeline.weights import objects_met
 from tests.closure import ROOT
 from tests.conftest import refused
 
@@ -193,6 +197,25 @@ def test_too_few_objects_are_found_before_any_training(
     params = compose("smoke", [f"scenes.objects=[{objects}]", override])
     with refused(words) if words else nullcontext():
         check_inputs(params)
+
+
+@pytest.mark.parametrize("listed", [True, False])
+def test_a_model_that_met_a_test_object_is_not_trained_on(
+    listed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By its config.json, or for older folders by its catalogue. Another fold's model met this fold's test objects."""
+    monkeypatch.chdir(ROOT)
+    (tmp_path / "language").mkdir()
+    folds = ["split.name=kfold", "split.folds=3", "scenes.objects=[]", f"language.start={tmp_path}"]
+    first, second = (compose("smoke", [*folds, f"ablation.seeds=[{seed}]"]) for seed in (0, 1))
+    objects = load_catalogue(ROOT / "pipeline" / "physiclear")
+    parts = assign_objects(objects, objects.objects, first.split, 0)
+    write_json(tmp_path / "config.json", {"objects": objects_met("", parts)} if listed else {})
+    write_json(tmp_path / "catalogue.json", objects.model_dump(mode="json"))
+    with nullcontext() if listed else refused("knows [a-z_]+, which is a test object"):
+        check_inputs(first)
+    with refused("knows [a-z_]+, which is a test object; name a model that does not"):
+        check_inputs(second)
 
 
 def test_variants_are_the_product_of_the_lists() -> None:

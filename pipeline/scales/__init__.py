@@ -12,7 +12,7 @@ from typing import Any
 import yaml
 
 from pipeline import weights
-from pipeline.config import LANGUAGE_DIR, Params
+from pipeline.config import Params
 from pipeline.config.params import PARAMS_FILE, kind_of, validate
 from pipeline.core.errors import UserError
 from pipeline.core.io import write_text
@@ -111,8 +111,6 @@ def check_inputs(params: Params) -> str:
     check_encoder_files(encoder, params.encoder.backbone)
     weights.check_language(language, "language.weights")
     check_language_files(language, "language.weights")
-    if params.language.start and not (Path(params.language.start) / LANGUAGE_DIR).is_dir():
-        raise UserError(f"language.start: {params.language.start} holds no trained model; name a folder of models/")
     return lacking
 
 
@@ -130,6 +128,7 @@ def check_objects(params: Params, catalogue: Catalogue) -> str:
     for seed in params.ablation.seeds:
         parts = assign_objects(catalogue, present, params.split, seed)
         training, tested = (sorted(o for o in present if parts.get(o) == part) for part in (Part.TRAIN, Part.TEST))
+        weights.objects_met(params.language.start, {o: parts[o] for o in present if o in parts})
         fold = params.split.fold_of(seed)
         where = f"split.name={params.split.name}" + (f", fold {fold}" if fold is not None else "")
         if fold is None and (absent := untested(parts, present)):

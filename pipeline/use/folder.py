@@ -6,6 +6,7 @@ language model, which is named by hash.
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Mapping
 from pathlib import Path
@@ -87,6 +88,8 @@ class ModelConfig(Record):
     (`distance`)."""
     temperatures: dict[str, Rounded]
     """By property, fitted on validation objects."""
+    objects: tuple[str, ...] = ()
+    """Ids of those that it, or the model that it started from, was trained on or validated by."""
     scores: dict[str, tuple[float, float, float]]
     """By task, on test questions: accuracy, and the ends of its interval."""
     files: dict[str, str]
@@ -97,7 +100,9 @@ class ModelConfig(Record):
     @property
     def digest(self) -> str:
         """A hash of all that answers depend on, by which two trainings of one variant are told apart."""
-        return fingerprint(self.model_copy(update={"scores": {}, "versions": {}}))
+        # Older folders list no objects, and keep their hash.
+        told = self.model_copy(update={"scores": {}, "versions": {}}).model_dump(mode="json", exclude={"objects"})
+        return fingerprint(json.dumps(told, sort_keys=True))
 
 
 def read_folder(folder: Path) -> tuple[ModelConfig, Catalogue]:

@@ -15,7 +15,18 @@ from pipeline.core.card import CARD_FILE, write_card
 from pipeline.core.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
 from pipeline.core.errors import UserError
 from pipeline.core.io import atomic_folder, read_json, read_jsonl, read_table, save_tensors, sha256, write_json
-from pipeline.core.records import Assignment, Classification, Encoder, Graded, Part, Probe, Question, Touch, Variant
+from pipeline.core.records import (
+    Assignment,
+    Classification,
+    Encoder,
+    Graded,
+    Lora,
+    Part,
+    Probe,
+    Question,
+    Touch,
+    Variant,
+)
 from pipeline.evaluation.calibration import calibration_rows, fit_temperature
 from pipeline.evaluation.grading import conclude
 from pipeline.evaluation.scores import score_rows
@@ -42,7 +53,7 @@ from pipeline.use.folder import (
 from pipeline.videos.audit.files import quiet_level
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.frames.store import PROBES_FILE
-from pipeline.weights import TIMM_WEIGHTS, backbone_files
+from pipeline.weights import OBJECTS_FILE, TIMM_WEIGHTS, backbone_files
 
 LIBRARIES = ("octopi-pipeline", "torch", "transformers", "peft", "open_clip_torch", "timm", "av")
 LIMITS = (
@@ -86,7 +97,8 @@ def package(data: Path, params: Params, variant: Variant, base: Base, out: Path)
         for file in files:
             _copy(file, folder / ENCODER_DIR / (SCENES if file == PRETRAINED else f"{BACKBONE_DIR}/{file.name}"))
         _copy(embeddings / STATISTICS_FILE, folder / ENCODER_DIR / STATISTICS_FILE)
-        trained = data / "models" / variant.lora / f"{variant.encoder}-{variant.opd}-{variant.seed}"
+        key = f"{variant.encoder}-{variant.opd}-{variant.seed}"
+        trained, aligned = data / "models" / variant.lora / key, data / "models" / Lora.WITHOUT / key
         for file in (trained / CONFIG_FILE, *sorted(trained.glob("*.safetensors"))):
             _copy(file, folder / LANGUAGE_DIR / file.name)
         if (trained / ADAPTER_DIR).is_dir():
@@ -108,6 +120,7 @@ def package(data: Path, params: Params, variant: Variant, base: Base, out: Path)
             quiet=quiet_level(read_table(data / "frames" / PROBES_FILE, Probe)),
             usual=_largest_distance(embeddings, data / "splits" / f"{variant.seed}.parquet", params),
             temperatures=temperatures,
+            objects=read_json(aligned / OBJECTS_FILE),
             scores={task: score[1:4] for task, score in scores.items()},
             files={f.relative_to(folder).as_posix(): sha256(f) for f in sorted(folder.rglob("*")) if f.is_file()},
             versions={"python": platform.python_version(), **{name: metadata.version(name) for name in LIBRARIES}},

@@ -6,14 +6,15 @@ Folders below data/weights/ are made by the stage `weights` (pipeline.weights.ma
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
 
-from pipeline.config import EncoderConfig
+from pipeline.config import LANGUAGE_DIR, EncoderConfig
 from pipeline.core.errors import UserError, did_you_mean
-from pipeline.core.io import sha256, tensor_shapes
+from pipeline.core.io import read_json, sha256, tensor_shapes
+from pipeline.core.records import Part
 
 if TYPE_CHECKING:
     import torch
@@ -100,6 +101,8 @@ DOWNLOADED = {
 
 CLIP_CONFIG = "open_clip_config.json"
 CLIP_WEIGHTS = ("open_clip_model.safetensors", "model.safetensors")
+OBJECTS_FILE = "objects.json"
+"""Beside an aligned model: what `objects_met` found."""
 TIMM_CONFIG = "config.json"
 TIMM_WEIGHTS = "model.safetensors"
 GET_CLIP = (
@@ -182,6 +185,27 @@ def check_language(folder: Path, key: str = "language.weights", *, exists: bool 
         pickles = any(folder.glob("*.bin"))
         found = "only pickles, which are refused because they can run code" if pickles else "no weights"
         raise UserError(f"{key}: {folder} has {found}; {mend}")
+
+
+def objects_met(start: str, parts: Mapping[str, Part]) -> list[str]:
+    """Ids of the objects that a training meets, with those that the model in `language.start` met before.
+
+    That model's are in its config.json, or else all of its catalogue's. One that is a test object is a UserError, since
+    scores would be of what the model knows.
+    """
+    met = {name for name, part in parts.items() if part in (Part.TRAIN, Part.VALIDATION)}
+    if start:
+        if not (Path(start) / LANGUAGE_DIR).is_dir():
+            raise UserError(f"language.start: {start} holds no trained model; name a folder of models/")
+        said = read_json(Path(start) / "config.json").get("objects")
+        known = set(said or read_json(Path(start) / "catalogue.json")["objects"])
+        if tested := sorted(name for name in known if parts.get(name) is Part.TEST):
+            raise UserError(
+                f"language.start: {start} knows {tested[0]}, which is a test object; name a model that does not (of "
+                "folds, the same fold's), or choose another split"
+            )
+        met |= known
+    return sorted(met)
 
 
 def load_language(folder: Path, key: str, **how: Any) -> PreTrainedModel:

@@ -47,6 +47,7 @@ from pipeline.use.results import Exchange
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.extract import extract_frames
 from pipeline.videos.frames.store import PROBES_FILE, FrameStore
+from pipeline.weights import OBJECTS_FILE, objects_met
 from tests.checkpoints import write_llama
 from tests.conftest import moving_square, write_video
 from tests.encoders import write_pretrained, write_timm, write_tower
@@ -126,8 +127,10 @@ def make(where: Path, variant: Variant, *overrides: str) -> Made:
             if name.startswith(("connector.", "words.")) or "lora_" in name:
                 strength = {"llm": 0.3, "words": 0.1, "connector": 1}[name.split(".")[0]]
                 value.copy_(torch.randn(value.shape, generator=draw) * strength)
-    trained = data / "models" / variant.lora / f"{variant.encoder}-{variant.opd}-0"
+    key = f"{variant.encoder}-{variant.opd}-0"
+    trained, aligned = (data / "models" / lora / key for lora in (variant.lora, Lora.WITHOUT))
     model.save_pretrained(trained)
+    write_json(aligned / OBJECTS_FILE, objects_met("", PARTS))
     questions = build_questions(pool_of(Part.TEST, parts, catalogue), ASKED, seed=0, distinct=False, facts=True)
     predictions = answer(model.eval(), embeddings, questions, variant.opd, params.language, params.frames.per_video)
     write_jsonl(data / "answers" / variant.key / "real.jsonl", predictions)

@@ -13,6 +13,7 @@ import yaml
 from typer.testing import CliRunner
 
 from pipeline.cli import app
+from pipeline.core.records import Part
 from pipeline.evaluation.grading import grade
 from pipeline.tasks import TASKS
 from pipeline.use.folder import FORMAT, Base, ModelConfig, read_folder
@@ -23,7 +24,7 @@ from tests.checkpoints import contents, edit, write_llama
 from tests.closure import ROOT
 from tests.conftest import refused
 from tests.fake_run import fake_params
-from tests.use.shared import Made
+from tests.use.shared import PARTS, Made
 
 
 @pytest.fixture
@@ -50,7 +51,9 @@ def test_it_holds_safetensors_and_text_alone_and_a_card(made: Made) -> None:
         assert metric["value"] == pytest.approx(np.mean([s.correct for s in own]), abs=1e-6), "of its own fold"
         assert metric["args"]["low"] <= metric["value"] <= metric["args"]["high"]
         assert metric["args"]["n"] == len(own)
-    assert next(iter(read_folder(made.folder)[0].base.files.values())) in text
+    config, _ = read_folder(made.folder)
+    assert next(iter(config.base.files.values())) in text
+    assert set(config.objects) == {name for name, part in PARTS.items() if part is not Part.TEST}
 
 
 def test_equal_inputs_give_equal_folders(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -70,8 +73,8 @@ def test_the_stage_packages_the_full_system_and_the_others_on_demand(
     """Each folder holds the whole encoder, and the chain trains eight variants."""
     shutil.copytree(made.folder.parents[1], tmp_path, dirs_exist_ok=True)
     shutil.rmtree(tmp_path / "models")
-    trained = tmp_path / "data" / "models" / "with"
-    shutil.copytree(trained / "finetuned-all-0", trained / "finetuned-none-0")
+    for trained in (tmp_path / "data" / "models").iterdir():
+        shutil.copytree(trained / "finetuned-all-0", trained / "finetuned-none-0")
     monkeypatch.chdir(tmp_path)
     for overrides, made_too in (([], []), (["packaged=all"], ["finetuned-with-none-0"])):
         lists = ["ablation.encoders=[finetuned]", "ablation.lora=[with]", "ablation.opd=[none,all]"]
