@@ -65,7 +65,7 @@ def provenance(
     test = {a.video_id: a.object_id for assignments in splits for a in assignments if a.part is Part.TEST}
     seeds, split = params.ablation.seeds, params.split
     folds = sorted({fold for seed in seeds if (fold := split.fold_of(seed)) is not None})
-    notes: dict[str, str] = yaml.safe_load(NOTES.read_text(encoding="utf-8"))
+    notes: dict[str, str] = yaml.safe_load(NOTES.read_text(encoding="utf-8")).get(catalogue.language.dataset, {})
     return {
         "report": params.report_name,
         "scale": params.scale,
@@ -79,7 +79,7 @@ def provenance(
         "seeds": list(seeds),
         "folds": {"of": split.folds, "tested": folds, "trained": split.train_objects} if folds else None,
         "replicates": len({split.replicate_of(seed) for seed in seeds}),
-        # What people noted about the test objects of this report, or else of its split.
+        # What people noted about the test objects of this report, or else of its split. Other data has other objects.
         "settings": notes.get(f"{params.report_name}/{split.name}", notes.get(split.name, "")),
         "intervals": coverage_note(asked),
         "facts_told": params.questions.facts,

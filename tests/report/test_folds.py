@@ -83,11 +83,13 @@ def test_effects_are_paired_within_a_fold(twice: Path) -> None:
 
 
 def test_one_fold_of_three_is_reported_as_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With what was noted of this report, and not what of all reports under such a split."""
-    (tmp_path / "notes.yaml").write_text("kfold: of all\nsmoke-scenes/kfold: of this one\n")
+    """With what was noted of this report, and not what of all reports under such a split, or of other data."""
+    (tmp_path / "notes.yaml").write_text("PhysiCLeAR:\n  kfold: of all\n  smoke-scenes/kfold: of this one\n")
     monkeypatch.setattr("pipeline.report.provenance.NOTES", tmp_path / "notes.yaml")
     folder = run(tmp_path, "[1]")
     assert load_report(folder).provenance["settings"] == "of this one"
+    (tmp_path / "notes.yaml").write_text("others:\n  kfold: of all\n  smoke-scenes/kfold: of this one\n")
+    assert load_report(run(tmp_path / "other", "[1]")).provenance["settings"] == ""
     text = (folder / "README.md").read_text()
     assert "1 of 3 folds (1) are in" in text
     assert "2 of 3 folds are still to be run" in text
