@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 
 from pipeline.core.errors import counted
-from pipeline.core.records import Shown
+from pipeline.core.records import Shown, Touch
 from pipeline.report.load import Report
 from pipeline.report.render import Block, render, size
 from pipeline.report.tables import FIVE_TASKS, PARTS, SHIPPED_TABLE, SHOWN_WORDS, TABLES, headline, measured, number
@@ -126,24 +126,30 @@ def _against_chance(rows: pd.DataFrame, whose: str = "The full system's") -> str
 def _touch(rows: pd.DataFrame, solved: Collection[str], impossible: str) -> str:
     """Whether answers use touch. In a task no better than chance (not in `solved`) a difference cannot show it.
 
-    Without touch, answers may lose their form; unreadable ones count as wrong, which makes a difference of its own.
+    Nor can one from touch that was removed: answers may need frames, and be the same with another object's. Without
+    touch they may also lose their form; unreadable ones count as wrong, which makes a difference of its own.
     """
     if not len(rows):
         return "Whether answers depend on touch was not tested."
-    *others, last = [change.partition(" - ")[2] for change in dict.fromkeys(rows["change"])]
-    instead = f"{', '.join(others)} or {last}" if others else last
-    fact = f"with real touch, against touch that was {instead}, accuracy differs by {_span(rows)}, task by task"
-    better = dict.fromkeys(rows.loc[(rows["p_holm"] < ALPHA) & (rows["difference"] > 0), "task"])
-    likely = rows[(rows["low"] > 0) & rows["task"].isin(solved)]
-    if sure := [task for task in better if task in solved]:
-        rest = " and ".join(task for task in better if task not in solved)
+    *others, last = instead = [change.partition(" - ")[2] for change in dict.fromkeys(rows["change"])]
+    named = f"{', '.join(others)} or {last}" if others else last
+    fact = f"with real touch, against touch that was {named}, accuracy differs by {_span(rows)}, task by task"
+    change = f"real - {Touch.SWAPPED if Touch.SWAPPED in instead else Touch.NOISE}"
+    better = rows[(rows["p_holm"] < ALPHA) & (rows["difference"] > 0)]
+    shown, tasks = {*better.loc[better["change"] == change, "task"]}, dict.fromkeys(better["task"])
+    sure = ", ".join(task for task in tasks if task in solved and task in shown)
+    needed = ", ".join(task for task in tasks if task in solved and task not in shown)
+    likely = rows[(rows["low"] > 0) & rows["task"].isin(solved) & (rows["change"] == change)]
+    frames = f" In {needed} answers need frames; that they depend on which touch is not shown." if needed else ""
+    if sure:
+        rest = " and ".join(task for task in tasks if task not in solved)
         none = f" In {rest} real touch brings no more than chance, so the difference shows nothing."
-        return f"Answers use touch in {', '.join(sure)}: {fact}.{none if rest else ''}"
+        return f"Answers use touch in {sure}: {fact}.{none if rest else ''}{frames}"
     if len(likely):
-        some = f"{len(likely)} of {len(rows)} intervals lie above 0, none is significant after Holm's adjustment"
-        return f"Answers may use touch: {fact}; {some}{impossible}."
-    none = "none significant after Holm's adjustment where real touch brings more than chance"
-    return f"That answers use touch is not shown: {fact}, {none}{impossible}."
+        of = f"{len(likely)} of {rows['change'].eq(change).sum()} intervals of `{change}` lie above 0"
+        return f"Answers may use touch: {fact}; {of}, none is significant after Holm's adjustment{impossible}.{frames}"
+    none = ", none significant after Holm's adjustment where real touch brings more than chance"
+    return f"That answers use touch is not shown: {fact}{'' if needed else none}{impossible}.{frames}"
 
 
 def _span(rows: pd.DataFrame) -> str:

@@ -48,6 +48,7 @@ def test_above_and_below_chance_are_said_only_where_the_whole_interval_is() -> N
 
 TOUCH = {"part": "touch", "change": "real - swapped"}
 RULES = {"part": "language", "change": "full system - heads and rules"}
+REMOVED = effect(part="touch", change="real - removed", p_holm=0.01, low=0.02)
 USED = effect(**TOUCH, p_holm=0.01, low=0.02)
 FORMED = effect(task="PSS", p_holm=0.001, difference=0.3)
 SWAPPED = "with real touch, against touch that was swapped"
@@ -60,10 +61,16 @@ SWAPPED = "with real touch, against touch that was swapped"
         ([USED], f"Answers use touch in PC: {SWAPPED}, accuracy differs by +10.0 to"),
         ([effect(**TOUCH, low=0.02)], f"Answers may use touch: {SWAPPED}"),
         ([effect(**TOUCH)], f"That answers use touch is not shown: {SWAPPED}"),
+        # Without frames answers may fail; that they depend on which touch only another object's shows, or else noise.
+        ([REMOVED, effect(**TOUCH)], "task by task. In PC answers need frames; that they depend on which touch is not"),
+        ([REMOVED], "That answers use touch is not shown: with real touch, against touch that was removed, accuracy"),
+        ([REMOVED, effect(**TOUCH, low=0.02)], "1 of 1 intervals of `real - swapped` lie above 0, none is significant"),
+        ([REMOVED, {**USED, "change": "real - noise"}, effect(**TOUCH)], "That answers use touch is not shown"),
+        ([REMOVED, {**USED, "change": "real - noise"}], "Answers use touch in PC: with real touch, against touch that"),
         ([effect(**TOUCH, p_holm=0.01, difference=-0.1, low=-0.2)], "That answers use touch is not shown"),
         (
             [effect(**TOUCH, low=0.02, objects=5)],
-            "none is significant after Holm's adjustment (5 objects are too few for that).",
+            "lie above 0, none is significant after Holm's adjustment (5 objects are too few for that).",
         ),
         # Without touch, answers to PSS may be no choice at all: the difference is then of form.
         ([{**USED, "task": "PSS"}], "That answers use touch is not shown"),
