@@ -40,7 +40,7 @@ BEYOND = {
     "questions": ("wording", "names", "inexact", "restate", "two_turns", "plainly"),
     "language": ("start", "normalize_touch"),
     "align": ("weighting", "begin_with_words"),
-    "lora": ("weighting", "target_modules", "dropout", "given"),
+    "lora": ("weighting", "target_modules", "dropout", "given", "skip_contradicted"),
 }
 """Settings by which a small model is trained otherwise than the paper's."""
 
@@ -97,12 +97,15 @@ def provenance(
 
 
 def beyond_paper(params: Params) -> dict[str, Any]:
-    """Those of `BEYOND` that are not as the paper has them, by their keys in params.yaml."""
+    """Those of `BEYOND` that have an effect and are not as the paper has them, by their keys in params.yaml."""
+    void = {"align.begin_with_words", "language.normalize_touch"} if params.language.start else set[str]()
+    void |= set() if params.questions.facts else {"questions.inexact"}
     return {
         f"{name}.{key}": getattr(section, key)
         for name, keys in BEYOND.items()
         for key in keys
         if getattr(section := getattr(params, name), key) != type(section).model_fields[key].default
+        and f"{name}.{key}" not in void
     }
 
 

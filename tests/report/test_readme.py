@@ -142,6 +142,12 @@ def test_what_the_figures_stand_on_is_said_in_words() -> None:
     assert beyond_paper(compose("paper-7b", [], ROOT / "conf")) == {}
     found = beyond_paper(compose("small", ["lora.given=0.7"], ROOT / "conf"))
     assert (found["lora.given"], found["questions.restate"], found["questions.wording"]) == (0.7, True, "class")
+    assert found["align.begin_with_words"] is found["language.normalize_touch"] is True
+    # The start has its connector, and without facts none is inexact.
+    begun = beyond_paper(compose("finetune", ["questions.facts=false"], ROOT / "conf"))
+    assert begun["language.start"]
+    assert begun["lora.skip_contradicted"] is True
+    assert not {"align.begin_with_words", "language.normalize_touch", "questions.inexact"} & {*begun}
     found |= {"language.start": "pipeline/pretrained/octopi-small"}
     said = report([], settings="", facts_told=True, intervals="Known to be narrow.", beyond_paper=found)
     assert "its training went on from `octopi-small`, which was trained before" in finding(said)[0]
