@@ -21,7 +21,7 @@ from pipeline.core.io import sha256, tensor_shapes
 from pipeline.core.records import Assignment, Part, Video
 from pipeline.evaluation.intervals import coverage_note
 from pipeline.videos.catalogue import Catalogue
-from pipeline.weights import BACKBONES
+from pipeline.weights import BACKBONES, reads_weights
 
 CODE = ("pipeline", "stages", "conf", "dvc.yaml")
 """What a result can depend on. A commit of a report alone does not change its revision."""
@@ -64,6 +64,7 @@ def provenance(
     rows = "\n".join(video.model_dump_json() for video in videos)
     test = {a.video_id: a.object_id for assignments in splits for a in assignments if a.part is Part.TEST}
     seeds, split = params.ablation.seeds, params.split
+    based = ("encoder", "language") if reads_weights(params.encoder) else ("language",)
     folds = sorted({fold for seed in seeds if (fold := split.fold_of(seed)) is not None})
     notes: dict[str, str] = yaml.safe_load(NOTES.read_text(encoding="utf-8")).get(catalogue.language.dataset, {})
     return {
@@ -90,7 +91,8 @@ def provenance(
         "params_sha256": sha256(root / PARAMS_FILE),
         "data_sha256": hashlib.sha256(rows.encode()).hexdigest(),
         "encoder": encoder_words(params.encoder),
-        "base_models": {part: base_model(root, getattr(params, part).weights) for part in ("encoder", "language")},
+        "base_models": {part: base_model(root, getattr(params, part).weights) for part in based},
+        "own_backbones": own_backbones(params.encoder),
         "python": platform.python_version(),
         "packages": {name: metadata.version(name) for name in PACKAGES},
     }
@@ -118,6 +120,11 @@ def encoder_words(config: EncoderConfig) -> str:
     }.get(config.recipe, f"an encoder of the recipe `{config.recipe}`")
     words += " on pictures of the difference to the untouched gel" if config.reference == "subtract" else ""
     return words + (", of which the language model gets heads' logits" if config.embedding == "logits" else "")
+
+
+def own_backbones(config: EncoderConfig) -> list[str]:
+    """In words, those of the base encoder's backbones that the chain pretrains itself."""
+    return [BACKBONES[name].words for name in config.backbone if BACKBONES[name].key != "weights"]
 
 
 def base_model(root: Path, folder: str) -> dict[str, Any]:

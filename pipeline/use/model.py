@@ -36,7 +36,7 @@ from pipeline.use.folder import ENCODER_DIR, SHIPPED, ModelConfig, chat_sample, 
 from pipeline.use.memory import Remembered, most_similar, recall, remember
 from pipeline.use.results import Choice, Comparison, Description, Exchange, Matching, Ranking, Recognition, Touch, Video
 from pipeline.videos.catalogue import Catalogue, Object, Property
-from pipeline.weights import is_random
+from pipeline.weights import is_random, reads_weights
 
 NUMBERED = re.compile(r"object \d+")
 ALONE = "the question compares, but there is one video: what it says of another is made up"
@@ -72,7 +72,7 @@ class Octopi:
         self.encoder = VideoEncoder(folder, config, catalogue, device)
         files = sorted((name, known) for name, known in config.files.items() if name.startswith(ENCODER_DIR))
         self._encoder_name = fingerprint(config.frames, *(part for file in files for part in file))
-        bases = (config.base.folder, config.encoder.weights)
+        bases = (config.base.folder, *([config.encoder.weights] if reads_weights(config.encoder) else []))
         self.doubts: tuple[str, ...] = (RANDOM,) if any(map(is_random, bases)) else ()
 
     def __repr__(self) -> str:

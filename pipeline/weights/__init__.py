@@ -331,6 +331,11 @@ BACKBONES = {
 """Values in `encoder.backbone`."""
 
 
+def reads_weights(config: EncoderConfig) -> bool:
+    """Whether a backbone reads `encoder.weights`, which else names a model that nothing uses."""
+    return any(BACKBONES[name].key == "weights" for name in config.backbone)
+
+
 def backbone_files(config: EncoderConfig) -> list[Path]:
     """What the frozen weights of the backbones are read from; a file that several read comes once."""
     used = [BACKBONES[name] for name in config.backbone]

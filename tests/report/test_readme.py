@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from pipeline.report.provenance import beyond_paper
+from pipeline.report.provenance import beyond_paper, provenance
 from pipeline.report.readme import CHANCE, MOST_LINES, finding, render_readme, sections
 from pipeline.scales import compose
+from pipeline.videos.catalogue import load_catalogue
 from tests.closure import ROOT
 from tests.report.conftest import effect, report, score
 
@@ -136,6 +138,18 @@ def test_spoilt_test_objects_are_no_headline() -> None:
     assert note in rest.split("| Task")[0]
     kfold = render_readme(report([score()], split="kfold", settings=note), ["curves.png"])
     assert "| Task" in kfold.split("## What the figures stand on")[0]
+
+
+@pytest.mark.parametrize(("backbone", "before"), [("[scenes]", "ablation: "), ("[clip,scenes]", "noted here, beside ")])
+def test_the_base_encoder_is_what_its_backbones_read(tmp_path: Path, backbone: str, before: str) -> None:
+    """`encoder.weights` names a random CLIP, which counts only where a backbone reads it."""
+    tuned = ("encoder.recipe=tuned", "encoder.reference=subtract", "language.weights=weights/a")
+    params = compose("smoke", [*tuned, f"encoder.backbone={backbone}"], ROOT / "conf")
+    (tmp_path / "params.yaml").touch()
+    said = report([], **provenance(params, load_catalogue(ROOT / params.data.catalogue), [], [], [], tmp_path))
+    text = render_readme(said, [])
+    assert f"{before}a convolutional network with synthetic pretraining." in text
+    assert ("tiny-clip" in text) == ("tiny and random" in text) == ("clip" in backbone)
 
 
 def test_what_the_figures_stand_on_is_said_in_words() -> None:
