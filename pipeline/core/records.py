@@ -321,6 +321,8 @@ class VisionModel(Record):
     another word of the endpoint's."""
     questions: dict[str, str]
     """By seed, the fingerprint of the file of questions that it answered."""
+    published: bool = False
+    """Whether it was asked the paper's three prompts alone; else as the full system is, with classes and examples."""
     folder: str = ""
     """Where its pictures lay."""
     frames: str = ""

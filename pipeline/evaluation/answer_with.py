@@ -159,6 +159,7 @@ def ask_all(
                     shown=shown,
                     per_video=most,
                     questions={str(seed): fingerprint(file) for seed, file in files.items()},
+                    published=published,
                     folder=str(folder),
                     frames=frames_key(folder) if shown is Shown.FRAMES else "",
                 )
