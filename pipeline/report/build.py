@@ -93,9 +93,10 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     # As the stage `questions` took it.
     taken = catalogue.asking(params.questions.scenarios).called(params.questions.names)
     for seed, classified in by_encoder.items():
-        # A video may be in the validation part of several folds, each time another encoder's.
+        # A video may be in the validation part of several folds, each time another encoder's. Replicates share folds.
+        fold = params.split.fold_of(seed)
         pooled[params.split.replicate_of(seed)] += [
-            c.model_copy(update={"video_id": f"{c.video_id}@{seed}"}) if c.part is Part.VALIDATION else c
+            c.model_copy(update={"video_id": f"{c.video_id}@{fold}"}) if c.part is Part.VALIDATION else c
             for c in classified
         ]
         concluded[params.split.replicate_of(seed)] += conclude(asked[seed], classified, taken)

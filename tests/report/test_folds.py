@@ -55,8 +55,9 @@ def test_two_replicates_of_three_folds_test_each_object_twice(twice: Path) -> No
     assert heads["n"] == len(tested)
     validated = [a.video_id for assignments in splits for a in assignments if a.part is Part.VALIDATION]
     assert len(set(validated)) < len(validated), "an object may validate several folds"
-    (heads,) = rows(folder, task="heads_validation", measure="combined", seed="0")
-    assert heads["n"] == len(validated)
+    for seed in ("0", "all"):
+        (heads,) = rows(folder, task="heads_validation", measure="combined", seed=seed)
+        assert heads["n"] == len(validated)
     confusion = pd.read_csv(folder / "confusion.csv")
     assert (confusion.groupby(["seed", "property"]).size() == len(tested)).all()
     said = load_report(folder).provenance
