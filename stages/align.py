@@ -12,9 +12,9 @@ if __name__ == "__main__":
     encoder, opd, seed = matrix_key(encoder=Encoder, opd=Opd, seed=None)
     key = f"{encoder}-{opd}-{seed}"
     with stage("align", key, launched=True) as run:
+        from pipeline.language.begin import begin_with_words
         from pipeline.language.octopi import ADAPTER_DIR
         from pipeline.language.training import Job, Material, assemble, fit, write_model_card
-        from pipeline.language.words import begin_with_words
 
         config = run.params.align
         assigned = read_table(DATA / "splits" / f"{seed}.parquet", Assignment)

@@ -14,7 +14,7 @@ from pipeline.config.params import load_params
 from pipeline.core.errors import UserError, without_secrets
 from pipeline.core.io import write_json
 from pipeline.encoder.recipes import RECIPES
-from pipeline.scales import check_inputs, compose, prune, shipped_scales, write_params
+from pipeline.scales import check_inputs, compose, prune, scale_names, write_params
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.split import assign_objects
 from pipeline.weights import objects_met
@@ -36,7 +36,7 @@ def test_a_new_scale_is_a_file(tmp_path: Path) -> None:
     conf = shutil.copytree(CONF, tmp_path / "conf")
     (conf / "lab.yaml").write_text("defaults: [small, _self_]\nscale: lab\nlora: {rank: 4}\n")
     names = "finetune, invented, lab, paper-13b, paper-7b, rehearsal, small, smoke"
-    assert ", ".join(shipped_scales(conf)) == names
+    assert ", ".join(scale_names(conf)) == names
     params = compose("lab", conf=conf)
     assert (params.scale, params.lora.rank, params.report_name) == ("lab", 4, "lab-scenes")
     write_params(params, tmp_path / "params.yaml")

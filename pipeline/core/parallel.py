@@ -31,7 +31,7 @@ M = TypeVar("M")
 R = TypeVar("R")
 
 _chosen: Backend = "processes"
-MOST_SECONDS = 5.0
+HANDOVER_SECONDS = 5.0
 """Seconds that a worker may take to hand over a result, after Ctrl-C, before it is ended."""
 
 
@@ -146,7 +146,7 @@ def _in_processes(work: Callable[[J], R], jobs: Sequence[J], label: str) -> Iter
         # worker from being terminated while it writes a result: the pool would wait for the rest of it.
         handing: Any = pool._result_queue._wlock  # type: ignore[attr-defined]
         if handing is not None:
-            handing.acquire(timeout=MOST_SECONDS)
+            handing.acquire(timeout=HANDOVER_SECONDS)
         # The pool's own thread then raises errors for jobs that are both cancelled and lost; they are hidden.
         threading.excepthook = lambda _: None
         for worker in multiprocessing.active_children():

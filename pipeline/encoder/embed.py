@@ -27,7 +27,7 @@ from pipeline.training.trainable import load_trainable
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.frames.store import FrameStore
 
-PART = 2**16
+ROWS_AT_ONCE = 2**16
 """Rows whose statistics are taken at a time."""
 
 
@@ -130,8 +130,8 @@ def statistics(embeddings: torch.Tensor, index: Sequence[Embedding], training: C
     """
     rows = torch.tensor([e.row for e in index if e.video_id in training and e.flip == "none"])
     # A part at a time, as float64 takes three times the room of all of them.
-    mean = sum((embeddings[part].double().sum(0) for part in rows.split(PART)), torch.tensor(0.0)) / len(rows)
-    squares = (((embeddings[part].double() - mean) ** 2).sum(0) for part in rows.split(PART))
+    mean = sum((embeddings[part].double().sum(0) for part in rows.split(ROWS_AT_ONCE)), torch.tensor(0.0)) / len(rows)
+    squares = (((embeddings[part].double() - mean) ** 2).sum(0) for part in rows.split(ROWS_AT_ONCE))
     deviation = (sum(squares, torch.tensor(0.0)) / len(rows)).sqrt()
     return Statistics(mean, torch.where(deviation > 0, deviation, torch.ones_like(deviation)))
 

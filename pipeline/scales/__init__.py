@@ -32,7 +32,7 @@ QUOTED = r"""'.*'|".*\""""
 HEADER = "# Written by `octopi scale`; change it with that command, or edit conf/ and run it again.\n"
 
 
-def shipped_scales(conf: Path = CONF) -> list[str]:
+def scale_names(conf: Path = CONF) -> list[str]:
     """Names of the scales that conf/ holds."""
     return sorted(f.stem for f in conf.glob("*.yaml") if f.stem != "base")
 
@@ -49,7 +49,7 @@ def compose(name: str, overrides: Sequence[str] = (), conf: Path = CONF) -> Para
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    scales = shipped_scales(conf)
+    scales = scale_names(conf)
     if name not in scales:
         raise UserError(f"scale {name!r} is not known; allowed: {', '.join(scales)}")
     forced, texts = list[str](), dict[str, str]()

@@ -11,8 +11,8 @@ import torch
 from torch.nn import functional as F
 
 from pipeline.core.records import Question
+from pipeline.language.begin import begin_with_words
 from pipeline.language.training import Material, assemble
-from pipeline.language.words import begin_with_words
 from tests.language.conftest import CATALOGUE, DIM, taking, write_store
 
 
@@ -32,7 +32,7 @@ def test_frames_read_like_the_words_of_their_classes(
     frames = [(v, f, "none") for v in sorted(labels) for f in range(3)]
     store = write_store(tmp_path, frames, torch.stack([felt(labels[v], drawn) for v, _, _ in frames]))
     language = held.language.model_copy(update={"normalize_touch": normalize})
-    monkeypatch.setattr("pipeline.language.words.STEPS", 150)
+    monkeypatch.setattr("pipeline.language.begin.STEPS", 150)
     model, data = assemble(replace(held, language=language, store=store), taking(14), "test")
     begin_with_words(model, data, CATALOGUE, seed=1)
     assert all(p.grad is None for p in model.parameters())
@@ -54,7 +54,7 @@ def test_frames_read_like_the_words_of_their_classes(
 
 
 def test_the_start_follows_from_the_seed(held: Material, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.language.words.STEPS", 5)
+    monkeypatch.setattr("pipeline.language.begin.STEPS", 5)
     begun = []
     for seed in (1, 1, 2):
         model, data = assemble(held, taking(14), "test")

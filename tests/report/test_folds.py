@@ -65,7 +65,7 @@ def test_two_replicates_of_three_folds_test_each_object_twice(twice: Path) -> No
     assert len(said["test_objects"]) * 2 == said["test_videos"] == len(tested)
     text = (folder / "README.md").read_text()
     assert "each of them in one of 3 folds that were not trained on, 2 times." in text
-    assert "3 of 3 folds (0, 1, 2) are in, each object of theirs was tested 2 times" in text
+    assert "3 of 3 folds (0, 1, 2) were run, each of their objects was tested 2 times" in text
 
 
 def test_effects_are_paired_within_a_fold(twice: Path) -> None:
