@@ -92,7 +92,7 @@ def test_one_fold_of_three_is_reported_as_one(tmp_path: Path, monkeypatch: pytes
     (tmp_path / "notes.yaml").write_text("others:\n  kfold: of all\n  smoke-scenes/kfold: of this one\n")
     assert load_report(run(tmp_path / "other", "[1]")).provenance["settings"] == ""
     text = (folder / "README.md").read_text()
-    assert "1 of 3 folds (1) are in" in text
+    assert "1 of 3 folds (1) were run" in text
     assert "2 of 3 folds are still to be run" in text
     graded = read_table(tmp_path / "data" / "graded.parquet", Graded)
     assert {(g.seed, g.trained) for g in graded} == {(0, 1)}
