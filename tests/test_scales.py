@@ -21,10 +21,11 @@ from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.core.errors import UserError
+from pipeline.core.records import Encoder, Part
 from pipeline.encoder.clip import VisualPrompts
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.scales import compose
-from pipeline.scales.cost import Hours, costs, measured_rate, work
+from pipeline.scales.cost import Hours, costs, disk, embedded, measured_rate, work
 from pipeline.scales.memory import (
     GIB,
     Lengths,
@@ -38,6 +39,7 @@ from pipeline.scales.memory import (
     tower_kept,
     trained_parameters,
 )
+from pipeline.videos.catalogue import Catalogue
 from pipeline.weights.check import parameters, read_language, read_tower
 from tests.checkpoints import write_clip, write_llama
 from tests.closure import ROOT
@@ -324,9 +326,25 @@ def test_a_training_s_operations_are_torch_s_own_count(tmp_path: Path) -> None:
         ],
     )
     lengths = Lengths(tokens, 0, 0, mean_training=tokens, mean_answer=0, mean_prompt=0)
-    found = work(params, read_shapes(params)._replace(lengths=lengths), 0)
+    found = work(params, read_shapes(params)._replace(lengths=lengths), 0, {})
     aligned = next(h for h in found if h.stage == "align")
     assert aligned.work == pytest.approx(counter.get_total_flops(), rel=0.1)
+
+
+def test_embeddings_are_counted_of_kept_frames_and_mirrored_where_trained_on(catalogue: Catalogue) -> None:
+    """By hand: 7 of 24 frames are kept, and not `frames.per_video`, the 5 that are shown."""
+    lists = ["ablation.encoders=[finetuned,base,words]", "ablation.seeds=[0,1]", "encoder.embedding=logits"]
+    params = compose("smoke", lists)
+    objects = [*params.scenes.objects] * 2
+    trained = 2 * sum(catalogue.objects[o].splits["paper"] is Part.TRAIN for o in params.scenes.objects)
+    rows = 7 * (4 * trained + len(objects) - trained)
+    found = embedded(params, catalogue, objects)
+    assert found == {"finetuned": (2 * rows, 2 * rows), "base": (rows, 2 * rows), "words": (0, 2 * rows)}
+    plain = embedded(compose("smoke", [*lists, "encoder.flip_probability=0"]), catalogue, objects)
+    assert plain[Encoder.BASE] == (7 * len(objects), 2 * 7 * len(objects))
+    shapes = read_shapes(params)._replace(embedding=1000)
+    written = f"{4e3 * 6 * rows / 1e9:.2g}"
+    assert f"(embeddings {written})" in disk(params, shapes, found, {"align": 0, "lora": 0})
 
 
 def test_hours_are_the_longer_of_computing_and_reading() -> None:

@@ -6,15 +6,20 @@ frozen weight; Kaplan et al. 2020, section 2.1) and from a device's rate. Stages
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from pipeline.config import Params
+from pipeline.core.embeddings import FLIPS
 from pipeline.core.errors import UserError, counted, did_you_mean
+from pipeline.core.records import Encoder, Part
 from pipeline.scales.memory import BYTES, FULL, GIB, Shapes, Use, launched, trained_parameters
 from pipeline.tasks.questions import counts_by_task
+from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import list_videos
+from pipeline.videos.frames.selection import kept_count
+from pipeline.videos.split import assign_objects
 from pipeline.weights import DOWNLOADED
 from pipeline.weights.check import layers, parameters
 
@@ -42,6 +47,8 @@ CARDS = {
 UTILISATION = 0.35
 """Share of a card's peak that training reaches: an assumption. Large trainings report .21 to .46 (Chowdhery et al.
 2022, table 3); small batches reach less."""
+USUAL_FRAMES = 112
+"""Frames of a video, which is not opened to count them: the paper's average."""
 REST = ("pretrain", "cross_validate", "finetune_encoder", "embed")
 """Stages that run a model and may not be counted: for want of shapes, videos, or a formula."""
 
@@ -72,9 +79,9 @@ def costs(params: Params, shapes: Shapes, uses: list[Use], card: str = "") -> It
         raise UserError(f"--card {card}: not known; {did_you_mean(card, CARDS)}it is one of {', '.join(CARDS)}")
     place = Path(params.data.dir)
     if params.data.source == "scenes":
-        videos = len(params.scenes.objects or shapes.catalogue.objects) * params.scenes.videos_per_object
+        objects = [*(params.scenes.objects or shapes.catalogue.objects)] * params.scenes.videos_per_object
     else:
-        videos = len(list_videos(place, shapes.catalogue).files) if place.is_dir() else 0
+        objects = [f.object_id for f in list_videos(place, shapes.catalogue).files] if place.is_dir() else []
     for folder, llm in ((Path(params.encoder.weights), None), (Path(params.language.weights), shapes.llm)):
         found = next((d for d in DOWNLOADED.values() if d.folder == folder.name), None)
         if found and not folder.is_dir():
@@ -82,8 +89,9 @@ def costs(params: Params, shapes: Shapes, uses: list[Use], card: str = "") -> It
             yield f"Download: {found.repository}, {size}, to {folder} (README, section Real weights)."
     if params.data.source == "videos" and not place.is_dir():
         yield f"Videos: {params.data.dir} is not there (README, section Real videos)."
-    hours = work(params, shapes, videos)
-    yield disk(params, shapes, videos, {h.stage: h.runs for h in hours})
+    rows = embedded(params, shapes.catalogue, objects)
+    hours = work(params, shapes, len(objects), rows)
+    yield disk(params, shapes, rows, {h.stage: h.runs for h in hours})
     yield from describe(hours, params, card)
     if card:
         yield from fits(uses, CARDS[card].gib)
@@ -96,11 +104,27 @@ def costs(params: Params, shapes: Shapes, uses: list[Use], card: str = "") -> It
         )
 
 
-def disk(params: Params, shapes: Shapes, videos: int, runs: Mapping[str, int]) -> str:
+def embedded(params: Params, catalogue: Catalogue, objects: Sequence[str]) -> dict[Encoder, tuple[int, int]]:
+    """By encoder, how many frames `embed` computes and how many it writes, from the object of each video.
+
+    All kept frames are, those of training videos in all mirrored versions; by the base encoder once for all seeds.
+    """
+    frames = params.scenes.frames if params.data.source == "scenes" else "recorded"
+    kept = kept_count(USUAL_FRAMES if frames == "recorded" else frames, params.frames)
+    seeds, times = params.ablation.seeds, len(FLIPS) if params.encoder.flip_probability else 1
+    weigh = {Part.TRAIN: times, Part.VALIDATION: 1, Part.TEST: 1, Part.UNUSED: 0}
+    splits = [assign_objects(catalogue, set(objects), params.split, seed) for seed in seeds] if objects else []
+    each = [[kept * weigh[parts.get(o, Part.UNUSED)] for parts in splits] for o in objects]
+    own, shared = sum(map(sum, each)), sum(map(max, each))
+    found = {Encoder.FINETUNED: (own, own), Encoder.BASE: (shared, shared * len(seeds)), Encoder.WORDS: (0, own)}
+    return {encoder: found[encoder] for encoder in params.ablation.encoders}
+
+
+def disk(params: Params, shapes: Shapes, rows: Mapping[Encoder, tuple[int, int]], runs: Mapping[str, int]) -> str:
     """What the chain writes of its own: embeddings, trained models, and the checkpoints of the one that trains."""
-    shown = videos * params.frames.per_video * FULL * shapes.embedding * (4 if params.encoder.flip_probability else 1)
-    total = shown * len(params.ablation.encoders) * len(params.ablation.seeds)
-    parts = [f"embeddings {_round(total / GB)}" if videos else "embeddings not known without the videos"]
+    shown = sum(written for _, written in rows.values())
+    total = shown * FULL * shapes.embedding
+    parts = [f"embeddings {_round(total / GB)}" if shown else "embeddings not known without the videos"]
     if shapes.llm is not None:
         connector, words, adapters = trained_parameters(params, shapes.llm, shapes.embedding)
         models = FULL * ((connector + words) * (runs["align"] + runs["lora"]) + adapters * runs["lora"])
@@ -114,8 +138,8 @@ def disk(params: Params, shapes: Shapes, videos: int, runs: Mapping[str, int]) -
     )
 
 
-def work(params: Params, shapes: Shapes, videos: int) -> list[Hours]:
-    """Count the stages' operations; `videos` is how many there are, 0 where that is not known."""
+def work(params: Params, shapes: Shapes, videos: int, rows: Mapping[Encoder, tuple[int, int]]) -> list[Hours]:
+    """Count the stages' operations; `videos` is how many there are, 0 where that is not known, `rows` as `embedded`."""
     found = []
     encoder, seeds, variants = params.encoder, len(params.ablation.seeds), params.ablation.variants()
     tower, llm, lengths = shapes.tower, shapes.llm, shapes.lengths
@@ -124,8 +148,7 @@ def work(params: Params, shapes: Shapes, videos: int) -> list[Hours]:
         shown = videos * params.frames.per_video
         if encoder.recipe in ("paper", "release"):
             found.append(Hours("finetune_encoder", seeds, 2 * seeds * encoder.epochs * shown * picture))
-        flips = 4 if encoder.flip_probability else 1
-        found.append(Hours("embed", seeds, seeds * len(params.ablation.encoders) * flips * shown * picture))
+        found.append(Hours("embed", 1, sum(computed for computed, _ in rows.values()) * picture))
     if llm is not None:
         inside = parameters(layers(llm))
         forward, outside = 2 * inside, parameters(llm) - inside
