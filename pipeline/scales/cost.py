@@ -14,7 +14,7 @@ from pipeline.config import Params
 from pipeline.core.embeddings import FLIPS
 from pipeline.core.errors import UserError, counted, did_you_mean
 from pipeline.core.records import Encoder, Part
-from pipeline.scales.memory import BYTES, FULL, GIB, Shapes, Use, launched, trained_parameters
+from pipeline.scales.memory import BYTES, FLOAT32_BYTES, GIB, Shapes, Use, launched, trained_parameters
 from pipeline.tasks.questions import counts_by_task
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import list_videos
@@ -109,8 +109,7 @@ def embedded(params: Params, catalogue: Catalogue, objects: Sequence[str]) -> di
 
     All kept frames are, those of training videos in all mirrored versions; by the base encoder once for all seeds.
     """
-    frames = params.scenes.frames if params.data.source == "scenes" else "recorded"
-    kept = kept_count(USUAL_FRAMES if frames == "recorded" else frames, params.frames)
+    kept = kept_count(params.scenes.frames if params.data.source == "scenes" else USUAL_FRAMES, params.frames)
     seeds, times = params.ablation.seeds, len(FLIPS) if params.encoder.flip_probability else 1
     weigh = {Part.TRAIN: times, Part.VALIDATION: 1, Part.TEST: 1, Part.UNUSED: 0}
     splits = [assign_objects(catalogue, set(objects), params.split, seed) for seed in seeds] if objects else []
@@ -123,13 +122,13 @@ def embedded(params: Params, catalogue: Catalogue, objects: Sequence[str]) -> di
 def disk(params: Params, shapes: Shapes, rows: Mapping[Encoder, tuple[int, int]], runs: Mapping[str, int]) -> str:
     """What the chain writes of its own: embeddings, trained models, and the checkpoints of the one that trains."""
     shown = sum(written for _, written in rows.values())
-    total = shown * FULL * shapes.embedding
+    total = shown * FLOAT32_BYTES * shapes.embedding
     parts = [f"embeddings {_round(total / GB)}" if shown else "embeddings not known without the videos"]
     if shapes.llm is not None:
         connector, words, adapters = trained_parameters(params, shapes.llm, shapes.embedding)
-        models = FULL * ((connector + words) * (runs["align"] + runs["lora"]) + adapters * runs["lora"])
+        models = FLOAT32_BYTES * ((connector + words) * (runs["align"] + runs["lora"]) + adapters * runs["lora"])
         # Weights and Adam's two means.
-        checkpoints = 3 * FULL * (connector + words + adapters)
+        checkpoints = 3 * FLOAT32_BYTES * (connector + words + adapters)
         parts += [f"data/models {_round(models / GB)}", f"checkpoints {_round(checkpoints / GB)} while one trains"]
         total += models + checkpoints
     return (

@@ -29,13 +29,13 @@ if TYPE_CHECKING:
     from transformers import PreTrainedModel
 
 GIB = 2**30
-FULL = 4
+FLOAT32_BYTES = 4
 """Bytes of a float32 value."""
 BYTES = {"auto": 4, "float32": 4, "bfloat16": 2, "float16": 2}
 """Bytes a value; for `auto` the most, since its format depends on the device."""
 NF4 = 0.5 + 1 / 64 + 4 / (64 * 256)
 """Bytes a value: four bits, a byte of scale for 64 of them, and a float32 for 256 such bytes (Dettmers et al. 2023)."""
-ADAM = 3 * FULL
+ADAM = 3 * FLOAT32_BYTES
 """Bytes a trained value besides its own: its gradient, and Adam's two means."""
 GATHERED = 2
 """Layers whose weights a sharded training holds whole: the one that computes and the one that is fetched."""
@@ -139,10 +139,10 @@ def count(params: Params, shapes: Shapes) -> list[Use]:
             pictures = params.frames.per_video * min(config.micro_batch_size or config.batch_size, config.batch_size)
             size = BYTES["float32" if config.autocast == "none" else config.autocast]
             activations = sum(tower_kept(tower, pictures, config.prompts, size))
-            held = FULL * (parameters(tower) + trained)
+            held = FLOAT32_BYTES * (parameters(tower) + trained)
             uses.append(Use("finetune_encoder", 1, held, ADAM * trained, activations))
-        _, passing = tower_kept(tower, config.embed_batch_size, config.prompts, FULL)
-        uses.append(Use("embed", 1, FULL * parameters(tower), 0, passing))
+        _, passing = tower_kept(tower, config.embed_batch_size, config.prompts, FLOAT32_BYTES)
+        uses.append(Use("embed", 1, FLOAT32_BYTES * parameters(tower), 0, passing))
     if shapes.llm is not None:
         uses += language_uses(params, shapes.llm, shapes.embedding, shapes.lengths)
     return uses
@@ -160,7 +160,7 @@ def layer_kept(width: int, heads: int, keys: int, queries: int, wide: int, stati
     Two norms keep what they read and their statistics, in float32; attention its queries and its outcome, its keys and
     values, and a sum a head; the wide part its factors.
     """
-    return 2 * (width + statistics) * FULL + 2 * (queries + keys) * size + heads * FULL + wide * size
+    return 2 * (width + statistics) * FLOAT32_BYTES + 2 * (queries + keys) * size + heads * FLOAT32_BYTES + wide * size
 
 
 def tower_kept(tower: VisionTransformer, frames: int, prompts: int, size: int) -> tuple[int, int]:
@@ -180,8 +180,8 @@ def tower_kept(tower: VisionTransformer, frames: int, prompts: int, size: int) -
     factors = 2 if isinstance(first.mlp.gelu, QuickGELU) else 1
     layer = layer_kept(width, first.attn.num_heads, width, width, factors * wide, 2, size)
     # Autocast makes copies of the frozen weights, and the derivatives keep them.
-    copies = size * sum(p.numel() for p in blocks.parameters() if p.ndim > 1) if size < FULL else 0
-    return tokens * (len(blocks) * layer + (width + 2) * FULL) + copies, 4 * tokens * wide * size
+    copies = size * sum(p.numel() for p in blocks.parameters() if p.ndim > 1) if size < FLOAT32_BYTES else 0
+    return tokens * (len(blocks) * layer + (width + 2) * FLOAT32_BYTES) + copies, 4 * tokens * wide * size
 
 
 def language_uses(params: Params, llm: PreTrainedModel, embedding: int, lengths: Lengths) -> Iterator[Use]:
@@ -197,26 +197,26 @@ def language_uses(params: Params, llm: PreTrainedModel, embedding: int, lengths:
     devices, sharded = launched(params.runtime.launcher)
     shards = devices if sharded else 1
     outside = parameters(llm) - parameters(layers(llm))
-    gathered = GATHERED * layer * held + outside * size + FULL * (connector + words) if shards > 1 else 0.0
+    gathered = GATHERED * layer * held + outside * size + FLOAT32_BYTES * (connector + words) if shards > 1 else 0.0
     all_trained = connector + words + adapters
     for stage, config, trained in (("align", params.align, connector + words), ("lora", params.lora, all_trained)):
         # What comes and goes at the widest place: the logits and their gradient, or three of a layer's middle.
         tokens, logits = config.micro_batch_size * lengths.training, config.micro_batch_size * lengths.answer
-        passing = max(2 * logits * llm.config.vocab_size * FULL, 3 * tokens * middle * size)
+        passing = max(2 * logits * llm.config.vocab_size * FLOAT32_BYTES, 3 * tokens * middle * size)
         yield Use(
             stage,
             devices,
-            parameters=(frozen + FULL * trained) / shards + gathered,
+            parameters=(frozen + FLOAT32_BYTES * trained) / shards + gathered,
             # Gradients are shared among devices at the end of an update; until then each adds up its own.
-            optimizer=FULL * trained + (ADAM - FULL) * trained / shards,
+            optimizer=FLOAT32_BYTES * trained + (ADAM - FLOAT32_BYTES) * trained / shards,
             # The newest gradient of all words, when what the layers kept is gone.
-            activations=max(language_kept(params, llm, config, lengths) + passing, FULL * words),
+            activations=max(language_kept(params, llm, config, lengths) + passing, FLOAT32_BYTES * words),
         )
     rows = language.generation_batch_size
     yield Use(
         "answer",
         1,
-        parameters=frozen + FULL * all_trained,
+        parameters=frozen + FLOAT32_BYTES * all_trained,
         optimizer=0,
         # The prompts are read at once: the widest maps' outcomes, and a mask for each pair of tokens.
         activations=rows * lengths.prompt * (3 * middle + 2 * hidden + lengths.prompt) * size,
@@ -250,15 +250,15 @@ def language_kept(params: Params, llm: PreTrainedModel, config: TrainConfig, len
     if isinstance(config, LoraTrainConfig):
         own = adapted(llm, config)
         # Each map casts or drops what it reads for itself; a GPU remembers in a byte whether a value was dropped.
-        read = sum(ends[0] for ends in own.values()) * (FULL + (config.dropout > 0))
-        if size == FULL and not config.dropout:
-            read = FULL * sum(maps[min(each)][0] for each in READ_TOGETHER if each & own.keys())
-        layer += len(own) * config.rank * FULL + read
+        read = sum(ends[0] for ends in own.values()) * (FLOAT32_BYTES + (config.dropout > 0))
+        if size == FLOAT32_BYTES and not config.dropout:
+            read = FLOAT32_BYTES * sum(maps[min(each)][0] for each in READ_TOGETHER if each & own.keys())
+        layer += len(own) * config.rank * FLOAT32_BYTES + read
     # With checkpointing, of each layer what it reads is kept; one at a time is computed again.
     each = blocks * hidden * size + layer if params.runtime.gradient_checkpointing else blocks * layer
     # The last norm, and logarithms of all words' probabilities.
-    loss = config.micro_batch_size * lengths.answer * llm.config.vocab_size * FULL
-    return int(tokens * (each + (hidden + 1) * FULL) + loss)
+    loss = config.micro_batch_size * lengths.answer * llm.config.vocab_size * FLOAT32_BYTES
+    return int(tokens * (each + (hidden + 1) * FLOAT32_BYTES) + loss)
 
 
 def launched(launcher: str) -> tuple[int, bool]:
