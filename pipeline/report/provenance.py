@@ -118,8 +118,8 @@ def encoder_words(config: EncoderConfig) -> str:
         "release": "the base CLIP with visual prompt tuning as the published code has it",
         "tuned": " beside ".join(BACKBONES[name].words for name in config.backbone) + ", tuned on the properties",
     }.get(config.recipe, f"an encoder of the recipe `{config.recipe}`")
-    words += " on pictures of the difference to the untouched gel" if config.reference == "subtract" else ""
-    return words + (", of which the language model gets heads' logits" if config.embedding == "logits" else "")
+    words += ", on pictures of the difference to the untouched gel" if config.reference == "subtract" else ""
+    return words + ("; the language model gets its heads' logits" if config.embedding == "logits" else "")
 
 
 def own_backbones(config: EncoderConfig) -> list[str]:

@@ -314,7 +314,7 @@ BACKBONES = {
     ),
     "timm": Backbone(
         "pipeline.encoder.timm_backbone",
-        "the network of encoder.weights",
+        "the base network",
         lambda folder: [folder / TIMM_CONFIG, folder / TIMM_WEIGHTS],
         # Frames of any size; the key `architecture` only shows that the file is timm's.
         side=lambda told: len(told["architecture"]) and 0,
