@@ -17,9 +17,9 @@ if __name__ == "__main__":
         from pipeline.language.training import Job, Material, assemble, fit, write_model_card
 
         config = run.params.align
+        material = Material.load(DATA, run.params, encoder, opd, seed)
         assigned = read_table(DATA / "splits" / f"{seed}.parquet", Assignment)
         met = objects_met(run.params.language.start, {a.object_id: a.part for a in assigned})
-        material = Material.load(DATA, run.params, encoder, opd, seed)
         model, data = assemble(material, config, "align")
         if config.begin_with_words and material.per_video and not run.params.language.start:
             begin_with_words(model, data, material.catalogue, material.seed)

@@ -344,7 +344,7 @@ def test_embeddings_are_counted_of_kept_frames_and_mirrored_where_trained_on(cat
     assert plain[Encoder.BASE] == (7 * len(objects), 2 * 7 * len(objects))
     shapes = read_shapes(params)._replace(embedding=1000)
     written = f"{4e3 * 6 * rows / 1e9:.2g}"
-    assert f"(embeddings {written})" in disk(params, shapes, found, {"align": 0, "lora": 0})
+    assert f"(embeddings {written}" in disk(params, shapes, found, {"align": 0, "lora": 0})
 
 
 def test_hours_are_the_longer_of_computing_and_reading() -> None:

@@ -125,7 +125,7 @@ def test_paper_13b_from_videos_to_the_report(project: Project) -> None:
         assert Counter(p.task for p in said) == dict.fromkeys(("OPD", "PC", "PSS", "POM", "PSR"), 4)
     readme = (project.folder / "reports" / "paper-13b-videos" / "README.md").read_text()
     assert "weights/vicuna-13b-v1.5" in readme
-    assert "1 of 3 folds (1) are in" in readme
+    assert "1 of 3 folds (1) were run" in readme
     assert (project.folder / "models" / SYSTEM / "README.md").is_file()
     assert not list((project.folder / "checkpoints").glob("*/*")), "nothing waits any more"
 
