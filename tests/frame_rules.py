@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -14,13 +14,20 @@ from PIL import Image as Pillow
 
 from pipeline.config import FramesConfig
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.decoding import Decoder, planes
+from pipeline.videos.decoding import Decoder, picture, planes
 from pipeline.videos.files import VideoFile
 from pipeline.videos.frames.extract import Extraction, extract_frames
 from pipeline.videos.frames.scan import Scan, scan
 
 CONFIG = FramesConfig(pixels=16)
 FILES = ("frames.npy", "references.npy", "frames.parquet", "probes.parquet")
+
+
+def decode(path: Path) -> Iterator[np.ndarray]:
+    """The pictures of a video: uint8, height x width x BGR; nothing where the file is no video."""
+    with Decoder(path) as decoder:
+        for frame in decoder.frames():
+            yield picture(frame)
 
 
 def constant(count: int, value: int = 77) -> list[np.ndarray]:

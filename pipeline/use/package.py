@@ -15,18 +15,7 @@ from pipeline.core.card import CARD_FILE, write_card
 from pipeline.core.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
 from pipeline.core.errors import UserError
 from pipeline.core.io import atomic_folder, read_json, read_jsonl, read_table, save_tensors, sha256, write_json
-from pipeline.core.records import (
-    Assignment,
-    Classification,
-    Encoder,
-    Graded,
-    Lora,
-    Part,
-    Probe,
-    Question,
-    Touch,
-    Variant,
-)
+from pipeline.core.records import Assignment, Classification, Encoder, Graded, Part, Probe, Question, Touch, Variant
 from pipeline.evaluation.calibration import calibration_rows, fit_temperature
 from pipeline.evaluation.grading import conclude
 from pipeline.evaluation.scores import score_rows
@@ -98,7 +87,7 @@ def package(data: Path, params: Params, variant: Variant, base: Base, out: Path)
             _copy(file, folder / ENCODER_DIR / (SCENES if file == PRETRAINED else f"{BACKBONE_DIR}/{file.name}"))
         _copy(embeddings / STATISTICS_FILE, folder / ENCODER_DIR / STATISTICS_FILE)
         key = f"{variant.encoder}-{variant.opd}-{variant.seed}"
-        trained, aligned = data / "models" / variant.lora / key, data / "models" / Lora.WITHOUT / key
+        trained, aligned = data / "models" / variant.lora / key, data / "models" / "without" / key
         for file in (trained / CONFIG_FILE, *sorted(trained.glob("*.safetensors"))):
             _copy(file, folder / LANGUAGE_DIR / file.name)
         if (trained / ADAPTER_DIR).is_dir():

@@ -98,13 +98,6 @@ class Decoder:
                 yield frame if frame.format.name in PLANAR else _reformat(frame, "yuv444p")
 
 
-def decode(path: Path) -> Iterator[Image]:
-    """Yield the frames that decode as pictures: uint8, height x width x BGR; nothing where the file is no video."""
-    with Decoder(path) as decoder:
-        for frame in decoder.frames():
-            yield picture(frame)
-
-
 def picture(frame: av.VideoFrame) -> Image:
     """A frame as uint8, height x width x BGR, turned as its metadata say."""
     image = np.asarray(_reformat(frame, "bgr24").to_ndarray(), dtype=np.uint8)

@@ -19,8 +19,8 @@ from pipeline.use.encoding import VideoEncoder
 from pipeline.use.frames import read_touch
 from pipeline.use.memory import TOUCHES
 from pipeline.use.model import Octopi
-from pipeline.videos.decoding import decode
 from tests.conftest import moving_square, refused, write_video
+from tests.frame_rules import decode
 from tests.use.shared import PARTS, Made, make, replay
 
 TUNED = ("encoder.recipe=tuned", "encoder.reference=subtract", "encoder.standardize=false")

@@ -17,9 +17,9 @@ import pytest
 
 from pipeline.use.serve import make_app
 from pipeline.use.server import Failed
-from pipeline.videos.decoding import decode
 from tests.closure import ROOT, imported
 from tests.conftest import deaf_port
+from tests.frame_rules import decode
 from tests.use.fake import FakeOctopi, digest, running
 from tests.use.videos import press
 

@@ -20,11 +20,11 @@ from pipeline.videos.audit import leakage
 from pipeline.videos.audit.files import quiet_level, touches
 from pipeline.videos.audit.run import audit_chain, audit_folder, check_folder
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.decoding import decode
 from pipeline.videos.files import list_videos
 from tests.audit_records import ERROR, GOOD_SPLIT, INFO, WARNING, assigned, look_at, odd, of, probe, probes
 from tests.closure import ROOT
 from tests.conftest import encode, moving_square, write_video
+from tests.frame_rules import decode
 
 pytestmark = pytest.mark.usefixtures("few_permutations")
 PAPER = SplitConfig(name="paper")

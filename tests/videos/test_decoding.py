@@ -14,10 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.config import FramesConfig
-from pipeline.videos.decoding import Decoder, Header, decode, fit, picture, planes, to_rgb, turns
+from pipeline.videos.decoding import Decoder, Header, fit, picture, planes, to_rgb, turns
 from pipeline.videos.film import KEY_EVERY, write_film
 from tests.conftest import encode, moving_square, refused, write_video
-from tests.frame_rules import frames_of, pillow
+from tests.frame_rules import decode, frames_of, pillow
 
 ONE = 1 << 16
 TURNED = {90: (0, -ONE, ONE, 0), 180: (-ONE, 0, 0, -ONE), 270: (0, ONE, -ONE, 0)}

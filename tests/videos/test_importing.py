@@ -22,13 +22,13 @@ from pipeline.core.errors import UserError
 from pipeline.core.io import read_csv
 from pipeline.core.records import Severity
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.decoding import Decoder, decode
+from pipeline.videos.decoding import Decoder
 from pipeline.videos.files import list_videos
 from pipeline.videos.film import write_film
 from pipeline.videos.frames.reference import LONGEST
 from pipeline.videos.importing.bags import shots
 from pipeline.videos.importing.presses import SHORTEST, FrameTime, cut, presses
-from tests.frame_rules import scanned
+from tests.frame_rules import decode, scanned
 from tests.use.videos import recording
 
 pytest.importorskip("rosbags", reason="needs rosbags: pip install -e '.[robot]'")

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 
 from pipeline.config import FramesConfig
 from pipeline.use.frames import read_touch
-from pipeline.videos.decoding import decode, fit, planes
+from pipeline.videos.decoding import fit, planes
 from pipeline.videos.frames.reference import LONGEST, MOST_FRAMES, reference_indices, thumbnail
 from pipeline.videos.frames.scan import Scan
 from pipeline.videos.frames.subtraction import subtract
 from tests.conftest import encode, write_video
-from tests.frame_rules import frames_of, scanned
+from tests.frame_rules import decode, frames_of, scanned
 from tests.numerics.test_frames import subtracted
 
 WIDTH, HEIGHT = 120, 90
