@@ -5,13 +5,14 @@ from pathlib import Path
 from pipeline.core.io import read_table, write_csv, write_text
 from pipeline.core.records import Finding, Probe
 from pipeline.core.stage import DATA, stage
-from pipeline.videos.audit.run import AUDIT_FILE, audit_chain, stop_on_errors, summary
 from pipeline.videos.catalogue import load_catalogue
-from pipeline.videos.frames.store import PROBES_FILE
 from pipeline.videos.split import read_splits
 
 if __name__ == "__main__":
     with stage("audit") as run:
+        from pipeline.videos.audit.run import AUDIT_FILE, audit_chain, stop_on_errors, summary
+        from pipeline.videos.frames.store import PROBES_FILE
+
         findings = audit_chain(
             Path(run.params.data.dir),
             read_table(DATA / "frames" / PROBES_FILE, Probe),

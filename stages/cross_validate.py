@@ -1,22 +1,24 @@
 """Cross-validate the encoder, frozen or tuned, or a constant over all objects with videos."""
 
+import re
 import sys
 from pathlib import Path
 
+from pipeline.config import COMPARED
 from pipeline.core.io import read_table, write_table
 from pipeline.core.records import Assignment, OutOfFold, Part, Video
 from pipeline.core.stage import DATA, matrix_key, stage
-from pipeline.encoder.cross_validation import MODELS, cross_validate_model, kind_of
-from pipeline.encoder.data import EncoderData
-from pipeline.encoder.finetune import Training
 from pipeline.videos.catalogue import load_catalogue
-from pipeline.videos.frames.store import REFERENCES_FILE, TABLE_FILE, FrameStore
 from pipeline.weights import backbone_files, check_encoder
 
 if __name__ == "__main__":
-    numbered = [word for word in sys.argv[1:] if kind_of(word)[0] in MODELS and kind_of(word)[1] != 0]
-    (name,) = matrix_key(model=(*MODELS, *numbered))
+    (name,) = matrix_key(model=[word for word in sys.argv[1:] if re.fullmatch(COMPARED, word)])
     with stage("cross_validate", name) as run:
+        from pipeline.encoder.cross_validation import cross_validate_model
+        from pipeline.encoder.data import EncoderData
+        from pipeline.encoder.finetune import Training
+        from pipeline.videos.frames.store import REFERENCES_FILE, TABLE_FILE, FrameStore
+
         params = run.params
         check_encoder(Path(params.encoder.weights), params.frames.pixels, params.encoder.backbone)
         videos = read_table(DATA / "videos.parquet", Video)

@@ -1,18 +1,16 @@
 """Compute the embeddings of every kept frame, by the base encoder and each fine-tuned one."""
 
+from __future__ import annotations
+
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import torch
-
-from pipeline.core.embeddings import STATISTICS_FILE
 from pipeline.core.io import fingerprint, read_table, save_tensors, write_table
 from pipeline.core.parallel import device_here
 from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Assignment, Embedding, Encoder, Part
 from pipeline.core.stage import DATA, Stage, stage
-from pipeline.encoder.embed import EncoderSource, embed_videos, logits_of, standardize, statistics, union
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.weights import check_encoder
 
@@ -45,6 +43,11 @@ def write(run: Stage, key: str, split: Sequence[Assignment], raw: torch.Tensor, 
 
 if __name__ == "__main__":
     with stage("embed") as run:
+        import torch
+
+        from pipeline.core.embeddings import STATISTICS_FILE
+        from pipeline.encoder.embed import EncoderSource, embed_videos, logits_of, standardize, statistics, union
+
         params = run.params
         check_encoder(Path(params.encoder.weights), params.frames.pixels, params.encoder.backbone)
         splits = {seed: read_table(DATA / "splits" / f"{seed}.parquet", Assignment) for seed in params.ablation.seeds}

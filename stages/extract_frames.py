@@ -7,10 +7,11 @@ from pipeline.core.records import Video
 from pipeline.core.runtime import CHECKPOINTS
 from pipeline.core.stage import DATA, stage
 from pipeline.videos.catalogue import load_catalogue
-from pipeline.videos.frames.extract import extract_frames
 
 if __name__ == "__main__":
     with stage("extract_frames") as run:
+        from pipeline.videos.frames.extract import extract_frames
+
         data = run.params.data
         found = extract_frames(
             Path(data.dir),

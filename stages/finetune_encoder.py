@@ -6,17 +6,18 @@ from pipeline.core.io import read_table, write_table
 from pipeline.core.records import Assignment, Classification, Measurement, Part
 from pipeline.core.runtime import resolve_device
 from pipeline.core.stage import DATA, matrix_key, stage
-from pipeline.encoder.data import EncoderData, classify
-from pipeline.encoder.finetune import Training, finetune, write_encoder_card
 from pipeline.tracking.live import live
-from pipeline.training.trainable import save_trainable
 from pipeline.videos.catalogue import load_catalogue
-from pipeline.videos.frames.store import REFERENCES_FILE, TABLE_FILE, FrameStore
 from pipeline.weights import backbone_files, check_encoder
 
 if __name__ == "__main__":
     (seed,) = matrix_key(seed=None)
     with stage("finetune_encoder", str(seed)) as run:
+        from pipeline.encoder.data import EncoderData, classify
+        from pipeline.encoder.finetune import Training, finetune, write_encoder_card
+        from pipeline.training.trainable import save_trainable
+        from pipeline.videos.frames.store import REFERENCES_FILE, TABLE_FILE, FrameStore
+
         params = run.params
         check_encoder(Path(params.encoder.weights), params.frames.pixels, params.encoder.backbone)
         split = DATA / "splits" / f"{seed}.parquet"

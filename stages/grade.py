@@ -5,12 +5,13 @@ from pathlib import Path
 from pipeline.core.io import read_jsonl, write_table
 from pipeline.core.records import Graded, GradedVision, Prediction, Question, Touch
 from pipeline.core.stage import DATA, stage
-from pipeline.evaluation.grading import EXTERNAL, grade, grade_vision_models
 from pipeline.videos.catalogue import load_catalogue
-from pipeline.videos.frames.store import frames_key
 
 if __name__ == "__main__":
     with stage("grade") as run:
+        from pipeline.evaluation.grading import EXTERNAL, grade, grade_vision_models
+        from pipeline.videos.frames.store import frames_key
+
         catalogue = load_catalogue(Path(run.params.data.catalogue)).called(run.params.questions.names)
         graded = []
         for variant in run.params.ablation.variants():

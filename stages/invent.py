@@ -4,10 +4,11 @@ from pathlib import Path
 
 from pipeline.config import INVENTED
 from pipeline.core.stage import stage
-from pipeline.scenes.invented import write_catalogue
 
 if __name__ == "__main__":
     with stage("invent") as run:
+        from pipeline.scenes.invented import write_catalogue
+
         INVENTED.mkdir(parents=True, exist_ok=True)
         if Path(run.params.data.catalogue) == INVENTED:
             write_catalogue(run.params.invent, INVENTED)

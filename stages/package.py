@@ -3,13 +3,14 @@
 from pathlib import Path
 
 from pipeline.core.stage import DATA, stage
-from pipeline.use.folder import Base
-from pipeline.use.package import package
 
 MODELS = Path("models")
 
 if __name__ == "__main__":
     with stage("package") as run:
+        from pipeline.use.folder import Base
+        from pipeline.use.package import package
+
         params = run.params
         base = Base.of(Path(params.language.weights))
         wanted = [v for v in params.ablation.variants() if v.full or params.packaged == "all"]

@@ -4,12 +4,13 @@ import logging
 from pathlib import Path
 
 from pipeline.core.stage import stage
-from pipeline.report.page import write_page
 from pipeline.tracking.publish import publish
 from pipeline.tracking.store import TrackingError
 
 if __name__ == "__main__":
     with stage("publish") as run:
+        from pipeline.report.page import write_page
+
         write_page(Path())
         try:
             print(publish(run.params), flush=True)

@@ -3,8 +3,9 @@
 from pathlib import Path
 
 from pipeline.core.stage import stage
-from pipeline.report.build import write_report
 
 if __name__ == "__main__":
     with stage("report") as run:
+        from pipeline.report.build import write_report
+
         run.metrics.update(write_report(run.params, Path()))

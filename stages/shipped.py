@@ -4,12 +4,13 @@ from pipeline.core.io import read_table, write_table
 from pipeline.core.records import GradedVision, Shown, Video
 from pipeline.core.runtime import limit_threads
 from pipeline.core.stage import DATA, stage
-from pipeline.use.folder import SHIPPED
-from pipeline.use.model import Octopi
-from pipeline.use.shipped import answers_about
 
 if __name__ == "__main__":
     with stage("shipped") as run:
+        from pipeline.use.folder import SHIPPED
+        from pipeline.use.model import Octopi
+        from pipeline.use.shipped import answers_about
+
         graded: list[GradedVision] = []
         if run.params.shipped:
             # As many on every machine, since sums depend on how they are shared out.

@@ -5,12 +5,13 @@ from pathlib import Path
 from pipeline.config import SCENES_DIR
 from pipeline.core.io import write_csv
 from pipeline.core.stage import stage
-from pipeline.scenes.recipe import load_recipes
-from pipeline.scenes.video import SceneRow, share_as_labelled, synthesize
 from pipeline.videos.catalogue import load_catalogue
 
 if __name__ == "__main__":
     with stage("synthesize") as run:
+        from pipeline.scenes.recipe import load_recipes
+        from pipeline.scenes.video import SceneRow, share_as_labelled, synthesize
+
         folder, config = Path(run.params.data.catalogue), run.params.scenes
         catalogue = load_catalogue(folder)
         SCENES_DIR.mkdir(parents=True, exist_ok=True)

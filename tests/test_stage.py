@@ -85,7 +85,7 @@ def test_what_people_change_while_a_stage_runs_is_no_silent_matter(here: Path) -
     catalogue = here / "mine"
     catalogue.mkdir()
     (catalogue / "objects.csv").write_text("one")
-    params = compose("smoke", [f"data.catalogue={catalogue}"], conf=ROOT / "conf")
+    params = compose("smoke", ["kernels=machine", f"data.catalogue={catalogue}"], conf=ROOT / "conf")
     write_params(params, here / "params.yaml")
     with pytest.raises(SystemExit, match=r"^split: mine/objects.csv was changed while it ran"), stage("split"):
         (catalogue / "objects.csv").write_text("two")

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from pipeline.core.errors import without_secrets
 from pipeline.core.records import Encoder, Lora, Opd, Touch, Variant
-from pipeline.core.runtime import DeviceName, DtypeName, Quantization
+from pipeline.core.runtime import DeviceName, DtypeName, Kernels, Quantization
 
 Fraction = Annotated[float, Field(gt=0, le=1)]
 Positive = Annotated[int, Field(ge=1)]
@@ -29,7 +29,8 @@ Recipe = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]*$")]
 Backend = Literal["processes", "ray"]
 TrainedEmbeddings = Literal["all", "new"]
 Selection = Literal["salient", "release", "contact"]
-Compared = Annotated[str, Field(pattern=r"^(constant|backbone|backbone-tuned)(-[1-9][0-9]*)?$")]
+COMPARED = r"^(constant|backbone|backbone-tuned)(-[1-9][0-9]*)?$"
+Compared = Annotated[str, Field(pattern=COMPARED)]
 
 INVENTED = Path("data/invented")
 """Where the chain puts the catalogue of invented objects; `data.catalogue` names it to have them."""
@@ -449,6 +450,9 @@ class Params(Section):
     scale: Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]*$")]
     """Name of the file in conf/ that this comes from."""
     seed: Seed = 0
+    kernels: Kernels = "machine"
+    """`portable`: stages give the same bytes on every x86-64 processor with AVX2, and take longer. `machine`: they
+    compute with what the processor has."""
     data: DataConfig
     invent: InventConfig = InventConfig()
     scenes: ScenesConfig
@@ -473,6 +477,8 @@ class Params(Section):
     def _sections_fit(self) -> Self:
         if self.data.source == "scenes" and Path(self.data.dir) != SCENES_DIR:
             raise ValueError(f"data.dir must be {SCENES_DIR} where data.source is scenes (set data.source=videos?)")
+        if self.kernels == "portable" and self.runtime.threads != 1:
+            raise ValueError("kernels=portable: sums follow the number of threads; set runtime.threads=1")
         held: dict[int, set[int | None]] = {}
         for seed in self.ablation.seeds:
             held.setdefault(self.split.replicate_of(seed), set()).add(self.split.fold_of(seed))

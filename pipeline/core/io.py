@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     import torch
 
 R = TypeVar("R", bound=Record)
+ROOT = Path(__file__).parents[2]
+"""Where the project lies: dvc.yaml, pipeline/, stages/."""
 REST = re.compile(r"\..+\.(\d{1,9})\.part(\.\w+)?")
 """Name of an unfinished file or folder: the name it will have, and the number of the process that is writing it."""
 
@@ -245,18 +247,17 @@ def fingerprint(*parts: BaseModel | str | int | Path) -> str:
 
 
 def code_of(stage: str) -> list[Path]:
-    """All files of code that dvc.yaml lists for a stage, or `stage@key`.
+    """All files of code that dvc.yaml lists for a stage, or `stage@key`, but those that .dvcignore leaves out.
 
     Their bytes are part of a checkpoint's key, so that work begun by another version of the code is not resumed.
     """
     import yaml
 
-    root = Path(__file__).parents[2]
-    stages = yaml.safe_load((root / "dvc.yaml").read_text(encoding="utf-8"))["stages"]
+    stages = yaml.safe_load((ROOT / "dvc.yaml").read_text(encoding="utf-8"))["stages"]
     deps = stages.get(stage.partition("@")[0], {}).get("deps", [])
-    listed = [root / d for d in deps if d.startswith(("pipeline/", "stages/"))]
-    files = [f for path in listed for f in ([path] if path.is_file() else sorted(path.rglob("*")))]
-    return [file for file in files if file.is_file() and file.suffix != ".pyc"]
+    listed = [ROOT / d for d in deps if d.split("/")[0] in ("pipeline", "stages")]
+    files = [f for path in listed for f in ([path] if path.is_file() else sorted(path.rglob("*"))) if f.is_file()]
+    return [f for f in files if f.suffix != ".pyc" and (f.suffix != ".md" or f.parent.name == "templates")]
 
 
 def _arrow(hint: Any) -> pa.DataType:

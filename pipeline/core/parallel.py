@@ -24,7 +24,7 @@ from typing import Any, TypeVar
 from pipeline.config import Backend
 from pipeline.config.params import check_code
 from pipeline.core.errors import UserError
-from pipeline.core.runtime import DeviceName, cores, progress, track
+from pipeline.core.runtime import PORTABLE, DeviceName, cores, progress, track
 
 J = TypeVar("J")
 M = TypeVar("M")
@@ -164,7 +164,9 @@ def _on_ray(work: Callable[[J], R], jobs: Sequence[J], label: str, device: bool)
     import ray
 
     try:
-        ray.init(ignore_reinit_error=True, log_to_driver=False, logging_level="ERROR")
+        # A cluster's workers were started by others; they compute with the same kernels.
+        kernels = {"env_vars": {name: os.environ[name] for name in PORTABLE if name in os.environ}}
+        ray.init(ignore_reinit_error=True, log_to_driver=False, logging_level="ERROR", runtime_env=kernels)
     except (OSError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(f"runtime.parallel: ray has no cluster ({reason}); start it, or unset its address") from None

@@ -27,6 +27,19 @@ CHECKPOINTS = Path("checkpoints")
 DeviceName = Literal["auto", "cpu", "cuda", "mps"]
 DtypeName = Literal["auto", "float32", "bfloat16", "float16"]
 Quantization = Literal["none", "nf4"]
+Kernels = Literal["portable", "machine"]
+
+PORTABLE = {
+    "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR",  # The locked NumPy's names.
+    "OPENBLAS_CORETYPE": "Haswell",
+    "ATEN_CPU_CAPABILITY": "avx2",
+    "ONEDNN_MAX_CPU_ISA": "AVX2",
+    "MKL_CBWR": "COMPATIBLE",  # On processors that are not Intel's, MKL honours no other.
+    "OPENBLAS_NUM_THREADS": "1",
+    "OPENCV_IPP": "avx2",
+    "MKL_DYNAMIC": "FALSE",  # Or MKL takes fewer threads where there are fewer cores.
+}
+"""Variables by which each library computes with the same AVX2 code on every x86-64 processor that has AVX2."""
 
 
 def derive_seed(*parts: object) -> int:
@@ -83,10 +96,24 @@ def resolve_dtype(name: DtypeName) -> torch.dtype:
     return dtype
 
 
+def use_kernels(kernels: Kernels) -> None:
+    """Let this process and those that it starts compute with `PORTABLE` kernels; `machine` changes nothing.
+
+    Libraries read the variables when they are loaded, so this comes before NumPy and torch are imported. On other
+    machines than x86-64 the variables mean nothing.
+    """
+    x86 = platform.machine() in ("x86_64", "AMD64")
+    if kernels == "machine" or not x86 or PORTABLE.items() <= os.environ.items():
+        return
+    if early := {"numpy", "torch"} & sys.modules.keys():
+        raise RuntimeError(f"{early} imported before the kernels were chosen: import it in the stage's body")
+    os.environ |= PORTABLE
+
+
 def limit_threads(count: int) -> None:
-    """Let torch use this many CPU threads, also where it is imported later; 0 leaves it as it is."""
+    """Let torch and MKL use this many CPU threads, also where they are imported later; 0 leaves them as they are."""
     if count:
-        os.environ["OMP_NUM_THREADS"] = str(count)
+        os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), str(count))
         if "torch" in sys.modules:
             sys.modules["torch"].set_num_threads(count)
 

@@ -25,7 +25,7 @@ from pipeline.core.errors import UserError
 from pipeline.core.io import code_of, remove_rests, sha256, write_json
 from pipeline.core.parallel import end_with_parent, use_backend
 from pipeline.core.records import Measurement
-from pipeline.core.runtime import CHECKPOINTS, cores, limit_threads, processor, quiet_libraries
+from pipeline.core.runtime import CHECKPOINTS, cores, limit_threads, processor, quiet_libraries, use_kernels
 
 DATA = Path("data")
 RUNS = Path("runs")
@@ -98,8 +98,10 @@ def stage(name: str, key: str | None = None, *, launched: bool = False) -> Itera
     """Run the body as the DVC stage `name` (with `@key` in a matrix).
 
     Args:
-        launched: Whether `runtime.launcher` starts it. What takes long to import belongs into the body then, since
-            this process ends there.
+        launched: Whether `runtime.launcher` starts it; this process ends there.
+
+    What computes is imported in the body, since libraries choose their kernels when they are loaded, and `kernels`
+    of params.yaml chooses first.
 
     A UserError, a disk that cannot be read or written, or want of memory ends it with one line and status 1. So does a
     change of params.yaml, code or catalogue while it runs: DVC would take the new files for what the outputs were made
@@ -114,6 +116,7 @@ def stage(name: str, key: str | None = None, *, launched: bool = False) -> Itera
         if number := next((name for name in TF32_VARIABLES if name in os.environ), None):
             raise UserError(f"{number} is set, which changes the format that numbers are computed in; unset it")
         params = load_params()
+        use_kernels(params.kernels)
         if launched:
             launch(params.runtime.launcher)
         with alone(full):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-import subprocess
 from collections.abc import Sequence
 from importlib import metadata
 from math import prod
@@ -17,14 +16,12 @@ import yaml
 from pipeline.config import EncoderConfig, Params
 from pipeline.config.params import PARAMS_FILE
 from pipeline.core.card import front_matter
-from pipeline.core.io import sha256, tensor_shapes
+from pipeline.core.io import ROOT, code_of, sha256, tensor_shapes
 from pipeline.core.records import Assignment, Part, Video
 from pipeline.evaluation.intervals import coverage_note
 from pipeline.videos.catalogue import Catalogue
 from pipeline.weights import BACKBONES, reads_weights
 
-CODE = ("pipeline", "stages", "conf", "dvc.yaml")
-"""What a result can depend on. A commit of a report alone does not change its revision."""
 PACKAGES = ("torch", "transformers", "peft", "open_clip_torch", "scipy", "scikit-learn", "dvc")
 UNKNOWN = "unknown"
 NOTES = Path(__file__).with_name("notes.yaml")
@@ -86,14 +83,14 @@ def provenance(
         "facts_told": params.questions.facts,
         "beyond_paper": beyond_paper(params),
         "command": "dvc repro",
-        "commit": _git(root, "log", "-1", "--format=%H", "--", *CODE) or UNKNOWN,
-        "changed": bool(_git(root, "status", "--porcelain", "--", *CODE)),
+        # Not the commit, which names itself no file that it holds; runs in MLflow have it.
+        "code_sha256": hash_of(code_of("report")),
         "params_sha256": sha256(root / PARAMS_FILE),
         "data_sha256": hashlib.sha256(rows.encode()).hexdigest(),
         "encoder": encoder_words(params.encoder),
         "base_models": {part: base_model(root, getattr(params, part).weights) for part in based},
         "own_backbones": own_backbones(params.encoder),
-        "python": platform.python_version(),
+        "python": ".".join(platform.python_version_tuple()[:2]),
         "packages": {name: metadata.version(name) for name in PACKAGES},
     }
 
@@ -151,15 +148,12 @@ def base_model(root: Path, folder: str) -> dict[str, Any]:
 
 def digest(folder: Path) -> str:
     """SHA-256 over the names and hashes of a folder's files, hidden ones (downloads leave them) left out."""
-    names = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
-    shown = [name for name in names if not any(part.startswith(".") for part in name.parts)]
-    listed = "".join(f"{name.as_posix()} {sha256(folder / name)}\n" for name in shown)
-    return hashlib.sha256(listed.encode()).hexdigest() if shown else UNKNOWN
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    shown = [file for file in files if not any(part.startswith(".") for part in file.relative_to(folder).parts)]
+    return hash_of(shown, folder) if shown else UNKNOWN
 
 
-def _git(root: Path, *arguments: str) -> str:
-    try:
-        done = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=True, timeout=30)
-    except (OSError, subprocess.SubprocessError):
-        return ""
-    return done.stdout.strip()
+def hash_of(files: Sequence[Path], folder: Path = ROOT) -> str:
+    """SHA-256 over the names in `folder` and the hashes of files."""
+    listed = "".join(f"{file.relative_to(folder).as_posix()} {sha256(file)}\n" for file in files)
+    return hashlib.sha256(listed.encode()).hexdigest()

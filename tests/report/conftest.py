@@ -64,7 +64,7 @@ def report(
     }
     data = {"source": "videos", "dataset": dataset, "videos": 9, "data_sha256": "d" * 64}
     tested = {"split": "paper", "test_objects": ["a", "b"], "test_videos": 4, "seeds": [0], "settings": ""}
-    run = {"scale": "small", "command": "dvc repro", "commit": "c" * 40, "changed": False, "python": "3"}
+    run = {"scale": "small", "command": "dvc repro", "code_sha256": "c" * 64, "python": "3"}
     system = {"encoder": "the base CLIP with visual prompt tuning", "base_models": models, "facts_told": False}
     facts = {**data, **tested, **run, **system, "packages": {"torch": "2"}, "intervals": "", "properties": {}, **said}
     # Text columns come first, then numbers.
