@@ -57,6 +57,7 @@ def write_run(root: Path, params: Params, *, objects: Sequence[str] = (), skill:
     catalogue = load_catalogue(Path(params.data.catalogue))
     root.mkdir(parents=True, exist_ok=True)
     (root / "params.yaml").write_text(yaml.safe_dump(params.model_dump(mode="json"), sort_keys=False))
+    (root / "conf").symlink_to(ROOT / "conf")
     for folder in (params.encoder.weights, params.language.weights):
         if is_random(folder):
             (root / folder).parent.mkdir(parents=True, exist_ok=True)

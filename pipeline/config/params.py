@@ -1,10 +1,11 @@
-"""The only reader of params.yaml, and its errors in one line."""
+"""The only reader of params.yaml and of the scales in conf/, and their errors in one line."""
 
 from __future__ import annotations
 
 import os
+import re
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,11 @@ from pydantic import BaseModel, ValidationError
 from pipeline.config import Params
 from pipeline.core.errors import UserError, did_you_mean
 
-PARAMS_FILE, CHAIN = Path("params.yaml"), Path("dvc.yaml")
+PARAMS_FILE, CHAIN, CONF = Path("params.yaml"), Path("dvc.yaml"), Path("conf")
 PACKAGE = Path(__file__).parents[1]
 RENAMED = {"frames.size": "frames.pixels"}
 """What a parameter was called before, and what it is called now."""
+QUOTED = r"""'.*'|".*\""""
 
 
 def check_code(folder: Path) -> None:
@@ -37,7 +39,7 @@ def in_project() -> None:
     experiment the process starts again, with the copy's code: what is recorded is then what runs.
     """
     here, script = Path.cwd(), Path(sys.argv[0]).absolute()
-    if not any(path.exists() for path in (CHAIN, PARAMS_FILE, Path("conf"))):
+    if not any(path.exists() for path in (CHAIN, PARAMS_FILE, CONF)):
         above = next((f"{folder}, " for folder in here.parents if (folder / CHAIN).is_file()), "")
         raise UserError(f"{here} has no {CHAIN}; go to {above}the project's folder")
     try:
@@ -74,6 +76,57 @@ def load_params(path: Path = PARAMS_FILE) -> Params:
     if not isinstance(values, dict):
         raise UserError(f"{path}: empty; `octopi scale smoke` writes it")
     return validate(values, str(path))
+
+
+def scale_names(conf: Path = CONF) -> list[str]:
+    """Names of the scales that conf/ holds."""
+    return sorted(f.stem for f in conf.glob("*.yaml") if f.stem != "base")
+
+
+def compose(name: str, overrides: Sequence[str] = (), conf: Path = CONF) -> Params:
+    """Compose a scale with `key=value` overrides by Hydra and validate the result.
+
+    Raises:
+        UserError: for an unknown scale or key, a value out of range, or an override that is not `key=value`.
+    """
+    from hydra import compose as hydra_compose
+    from hydra import initialize_config_dir
+    from hydra.errors import HydraException
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    scales = scale_names(conf)
+    if name not in scales:
+        raise UserError(f"scale {name!r} is not known; allowed: {', '.join(scales)}")
+    forced, texts = list[str](), dict[str, str]()
+    for override in overrides:
+        key, equals, value = override.partition("=")
+        if not equals:
+            raise UserError(f"{override!r} is no override; write key=value, for example split.name=development")
+        if kind_of(key.lstrip("+").split(".")) is str and not re.fullmatch(QUOTED, value, re.DOTALL):
+            # As it stands: Hydra's grammar would read brackets, commas or blanks of a path.
+            texts[key.lstrip("+")] = value
+        else:
+            # Every key may be set; whether it exists is the validation's matter, since that knows what is allowed.
+            forced.append(override if key.startswith(("+", "~")) else f"++{override}")
+    # A recipe brings its own values; they give way to what is set beside it.
+    if (conf / "recipe" / f"{texts.get('encoder.recipe')}.yaml").is_file():
+        forced.insert(0, f"recipe={texts['encoder.recipe']}")
+    try:
+        with initialize_config_dir(str(conf.resolve()), version_base=None):
+            composed = hydra_compose(name, overrides=forced)
+        for key, value in texts.items():
+            OmegaConf.update(composed, key, value, force_add=True)
+        values = OmegaConf.to_container(composed, resolve=True)
+    except (HydraException, OmegaConfBaseException, yaml.YAMLError, UnicodeDecodeError) as error:
+        raise UserError(f"scale {name}: {' '.join(str(error).split())}") from None
+    assert isinstance(values, dict)
+    params = validate({str(k): v for k, v in values.items()}, f"scale {name}")
+    if params.scale != name:
+        raise UserError(
+            f"{conf / name}.yaml: it calls itself {params.scale}, and would replace its reports; write scale: {name}"
+        )
+    return params
 
 
 class OneKeyLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]

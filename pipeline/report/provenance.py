@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 
 from pipeline.config import EncoderConfig, Params
-from pipeline.config.params import PARAMS_FILE
+from pipeline.config.params import CONF, PARAMS_FILE, compose
 from pipeline.core.card import front_matter
 from pipeline.core.io import ROOT, code_of, sha256, tensor_shapes
 from pipeline.core.records import Assignment, Part, Video
@@ -33,13 +33,11 @@ ARCHITECTURES = {
     "gpt_neox": "GPT-NeoX",
     "tf_efficientnet_lite0": "EfficientNet-Lite0",
 }
-BEYOND = {
-    "questions": ("wording", "names", "inexact", "restate", "two_turns", "plainly"),
-    "language": ("start", "normalize_touch"),
-    "align": ("weighting", "begin_with_words"),
-    "lora": ("weighting", "target_modules", "dropout", "given", "skip_contradicted"),
+UNTOLD = {
+    *("scale", "seed", "data", "invent", "scenes", "split", "cross_validation", "ablation", "shipped", "packaged"),
+    *("tracking", "runtime", "weights", "evaluation", "micro_batch_size", "embed_batch_size", "generation_batch_size"),
 }
-"""Settings by which a small model is trained otherwise than the paper's."""
+"""Sections and keys of params.yaml that change no result, or that other facts of a report are about."""
 
 
 def provenance(
@@ -81,7 +79,7 @@ def provenance(
         "settings": notes.get(f"{params.report_name}/{split.name}", notes.get(split.name, "")),
         "intervals": coverage_note(asked),
         "facts_told": params.questions.facts,
-        "beyond_paper": beyond_paper(params),
+        "beyond_paper": beyond_paper(params, root / CONF),
         "command": "dvc repro",
         # Not the commit, which names itself no file that it holds; runs in MLflow have it.
         "code_sha256": hash_of(code_of("report")),
@@ -95,16 +93,23 @@ def provenance(
     }
 
 
-def beyond_paper(params: Params) -> dict[str, Any]:
-    """Those of `BEYOND` that have an effect and are not as the paper has them, by their keys in params.yaml."""
-    void = {"align.begin_with_words", "language.normalize_touch"} if params.language.start else set[str]()
-    void |= set() if params.questions.facts else {"questions.inexact"}
+def beyond_paper(params: Params, conf: Path) -> dict[str, Any]:
+    """The settings that have an effect and are not those of `paper-7b` in the folder `conf`, by their keys."""
+    encoder, start = params.encoder, params.language.start
+    void = UNTOLD | ({"begin_with_words", "normalize_touch"} if start else set())
+    void |= set() if params.questions.facts else {"inexact"}
+    void |= set() if "scenes" in encoder.backbone else {"pretrain"}
+    void |= set() if "timm" in encoder.backbone else {"feature_stage"}
+    if "clip" not in encoder.backbone:
+        void |= {"prompts", "prompt_layers"} | (set() if encoder.embedding == "logits" else {"embedding"})
+    own, papers = (each.model_dump(mode="json") for each in (params, compose("paper-7b", conf=conf)))
+    own["language"]["start"] = named(start)
     return {
-        f"{name}.{key}": getattr(section, key)
-        for name, keys in BEYOND.items()
-        for key in keys
-        if getattr(section := getattr(params, name), key) != type(section).model_fields[key].default
-        and f"{name}.{key}" not in void
+        f"{section}.{key}": value
+        for section in own
+        if section not in void
+        for key, value in own[section].items()
+        if value != papers[section][key] and key not in void
     }
 
 
@@ -128,7 +133,7 @@ def base_model(root: Path, folder: str) -> dict[str, Any]:
     """Folder, kind, size in parameters, hash of a base model, and what its card says that it was taught.
 
     `parameters` are counted from the headers of its safetensors files. Where files are missing, they are 0 and the
-    hash is "unknown". Of a place of this machine the last part alone is named.
+    hash is "unknown".
     """
     where, kind = root / folder, "model"
     if (where / "open_clip_config.json").is_file():
@@ -138,12 +143,17 @@ def base_model(root: Path, folder: str) -> dict[str, Any]:
         name = str(config.get("model_type") or config.get("architecture", kind))
         kind = ARCHITECTURES.get(name, name)
     return {
-        "folder": Path(folder).name if folder.startswith("~") or Path(folder).is_absolute() else folder,
+        "folder": named(folder),
         "kind": kind,
         "parameters": sum(prod(s) for file in where.glob("*.safetensors") for s in tensor_shapes(file).values()),
         "sha256": digest(where),
         "taught": str(front_matter(where).get("taught", "")),
     }
+
+
+def named(folder: str) -> str:
+    """A folder as a report names it: of a place of this machine the last part alone."""
+    return Path(folder).name if folder.startswith("~") or Path(folder).is_absolute() else folder
 
 
 def digest(folder: Path) -> str:

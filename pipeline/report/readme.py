@@ -54,7 +54,8 @@ def sections(report: Report) -> dict[str, Any]:
         a `Block` each, or None; `tables`, the other blocks of the registry; `finding`; `plumbing`, a warning where a
         base model is a random one; `looked_at`, how recipes were chosen by the test objects, if these are the
         development split's; `other_models`, where published figures stand beside; `stands_on`, what a figure is worth:
-        models with their size, test objects, seeds; `origin`: command, commit, data, base models by hash, packages.
+        models with their size, test objects, seeds; `beyond`, the settings that its last fact counts; `origin`:
+        command, commit, data, base models by hash, packages.
     """
     said, shipped, tasks = report.provenance, SHIPPED_TABLE.block(report), FIVE_TASKS.block(report)
     if shipped:
@@ -77,6 +78,7 @@ def sections(report: Report) -> dict[str, Any]:
         "looked_at": said["settings"] if said["split"] == "development" else "",
         "other_models": OTHER_MODELS if len(report.published) else "",
         "stands_on": render("stands_on.md", said=said, shown=SHOWN_WORDS).splitlines(),
+        "beyond": render("beyond.md", said=said).strip(),
         "origin": render("origin.md", said=said).splitlines(),
     }
 

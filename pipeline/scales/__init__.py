@@ -1,11 +1,9 @@
-"""Choosing a scale: composes conf/ into params.yaml, whole or not at all."""
+"""Choosing a scale: whether what it needs is there, and writing params.yaml, whole or not at all."""
 
 from __future__ import annotations
 
-import re
 import shlex
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +11,7 @@ import yaml
 
 from pipeline import weights
 from pipeline.config import Params
-from pipeline.config.params import PARAMS_FILE, kind_of, validate
+from pipeline.config.params import PARAMS_FILE, compose, scale_names
 from pipeline.core.errors import UserError
 from pipeline.core.io import write_text
 from pipeline.core.parallel import check_backend
@@ -27,60 +25,8 @@ from pipeline.videos.files import list_videos, raise_errors
 from pipeline.videos.split import FEWEST_TRAINING_OBJECTS, assign_objects, untested
 from pipeline.weights.check import check_encoder_files, check_language_files
 
-CONF = Path("conf")
-QUOTED = r"""'.*'|".*\""""
+__all__ = ["check_inputs", "check_objects", "compose", "prune", "scale_names", "write_params"]
 HEADER = "# Written by `octopi scale`; change it with that command, or edit conf/ and run it again.\n"
-
-
-def scale_names(conf: Path = CONF) -> list[str]:
-    """Names of the scales that conf/ holds."""
-    return sorted(f.stem for f in conf.glob("*.yaml") if f.stem != "base")
-
-
-def compose(name: str, overrides: Sequence[str] = (), conf: Path = CONF) -> Params:
-    """Compose a scale with `key=value` overrides by Hydra and validate the result.
-
-    Raises:
-        UserError: for an unknown scale or key, a value out of range, or an override that is not `key=value`.
-    """
-    from hydra import compose as hydra_compose
-    from hydra import initialize_config_dir
-    from hydra.errors import HydraException
-    from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
-
-    scales = scale_names(conf)
-    if name not in scales:
-        raise UserError(f"scale {name!r} is not known; allowed: {', '.join(scales)}")
-    forced, texts = list[str](), dict[str, str]()
-    for override in overrides:
-        key, equals, value = override.partition("=")
-        if not equals:
-            raise UserError(f"{override!r} is no override; write key=value, for example split.name=development")
-        if kind_of(key.lstrip("+").split(".")) is str and not re.fullmatch(QUOTED, value, re.DOTALL):
-            # As it stands: Hydra's grammar would read brackets, commas or blanks of a path.
-            texts[key.lstrip("+")] = value
-        else:
-            # Every key may be set; whether it exists is the validation's matter, since that knows what is allowed.
-            forced.append(override if key.startswith(("+", "~")) else f"++{override}")
-    # A recipe brings its own values; they give way to what is set beside it.
-    if (conf / "recipe" / f"{texts.get('encoder.recipe')}.yaml").is_file():
-        forced.insert(0, f"recipe={texts['encoder.recipe']}")
-    try:
-        with initialize_config_dir(str(conf.resolve()), version_base=None):
-            composed = hydra_compose(name, overrides=forced)
-        for key, value in texts.items():
-            OmegaConf.update(composed, key, value, force_add=True)
-        values = OmegaConf.to_container(composed, resolve=True)
-    except (HydraException, OmegaConfBaseException, yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UserError(f"scale {name}: {' '.join(str(error).split())}") from None
-    assert isinstance(values, dict)
-    params = validate({str(k): v for k, v in values.items()}, f"scale {name}")
-    if params.scale != name:
-        raise UserError(
-            f"{conf / name}.yaml: it calls itself {params.scale}, and would replace its reports; write scale: {name}"
-        )
-    return params
 
 
 def check_inputs(params: Params) -> str:

@@ -146,26 +146,40 @@ def test_the_base_encoder_is_what_its_backbones_read(tmp_path: Path, backbone: s
     tuned = ("encoder.recipe=tuned", "encoder.reference=subtract", "language.weights=weights/a")
     params = compose("smoke", [*tuned, f"encoder.backbone={backbone}"], ROOT / "conf")
     (tmp_path / "params.yaml").touch()
+    (tmp_path / "conf").symlink_to(ROOT / "conf")
     said = report([], **provenance(params, load_catalogue(ROOT / params.data.catalogue), [], [], [], tmp_path))
     text = render_readme(said, [])
     assert f"{before}a convolutional network with synthetic pretraining." in text
     assert ("tiny-clip" in text) == ("tiny and random" in text) == ("clip" in backbone)
 
 
-def test_what_the_figures_stand_on_is_said_in_words() -> None:
-    assert beyond_paper(compose("paper-7b", [], ROOT / "conf")) == {}
-    found = beyond_paper(compose("small", ["lora.given=0.7"], ROOT / "conf"))
-    assert (found["lora.given"], found["questions.restate"], found["questions.wording"]) == (0.7, True, "class")
+def test_every_setting_that_is_not_papers_is_counted_and_named_in_the_fold() -> None:
+    conf = ROOT / "conf"
+    assert beyond_paper(compose("paper-7b", [], conf), conf) == beyond_paper(compose("paper-13b", [], conf), conf) == {}
+    rates = {"encoder.learning_rate": 0.5, "lora.rank": 3, "frames.fraction": 0.9, "encoder.flip_probability": 0.25}
+    idle = ("encoder.feature_stage=1", "pretrain.steps=1", "questions.inexact=0.5", "align.micro_batch_size=2")
+    set_so = [f"{key}={value}" for key, value in rates.items()]
+    assert beyond_paper(compose("paper-7b", [*set_so, *idle, "seed=1"], conf), conf) == rates
+    found = beyond_paper(compose("small", ["lora.given=0.7", "pretrain.steps=1"], conf), conf)
+    assert (found["lora.given"], found["questions.restate"], found["pretrain.steps"]) == (0.7, True, 1)
     assert found["align.begin_with_words"] is found["language.normalize_touch"] is True
-    # The start has its connector, and without facts none is inexact.
-    begun = beyond_paper(compose("finetune", ["questions.facts=false"], ROOT / "conf"))
-    assert begun["language.start"]
-    assert begun["lora.skip_contradicted"] is True
+    assert "encoder.embedding" not in found, "CLIP's alone"
+    # The start has its connector, and without facts none is inexact; a place of this machine is not told.
+    begun = beyond_paper(compose("finetune", ["questions.facts=false", "language.start=/home/me/model"], conf), conf)
+    assert (begun["language.start"], begun["lora.skip_contradicted"]) == ("model", True)
     assert not {"align.begin_with_words", "language.normalize_touch", "questions.inexact"} & {*begun}
+
+
+def test_what_the_figures_stand_on_is_said_in_words() -> None:
+    found = {"questions.restate": True, "lora.dropout": 0.0, "lora.target_modules": ["q", "k"]}
     found |= {"language.start": "pipeline/pretrained/octopi-small"}
     said = report([], settings="", facts_told=True, intervals="Known to be narrow.", beyond_paper=found)
     assert "its training went on from `octopi-small`, which was trained before" in finding(said)[0]
     facts = "\n".join(sections(said)["stands_on"])
     told = ["2 (a, b), 4 videos, split `paper`", "Nothing is noted", "Known to be narrow.", "ask for touch"]
-    assert all(words in facts for words in (*told, *(f"`{key}={value}`" for key, value in found.items())))
-    assert "the paper has not" not in "\n".join(sections(report([], beyond_paper={}))["stands_on"])
+    assert all(words in facts for words in (*told, "in 4 settings"))
+    fold = "questions: `restate=True`; lora: `dropout=0.0`, `target_modules=[q, k]`; language: `start=pipeline/pre"
+    assert fold in next(line for line in render_readme(said, []).splitlines() if "in 4 settings" in line)
+    same = report([], beyond_paper={})
+    assert "otherwise than" not in "\n".join(sections(same)["stands_on"])
+    assert "<details>" not in render_readme(same, [])
