@@ -73,8 +73,8 @@ def published(dataset: str = DATASET) -> pd.DataFrame:
     """The paper's figures about a data set: `KEYS`, model, value, n; no row where it is none of `DATASETS`.
 
     `value` is as printed: percent, a count, frames or an ICC. `model` is 7b, 13b, CLIP (the heads, without a language
-    model), PG-InstructBLIP (which only sees) or `chance`. The paper gives no numbers of questions: n are the ones that
-    its percentages fit.
+    model), PG-InstructBLIP (which only sees) or `chance`. `n` is text. Where it begins with ~ the paper prints none:
+    these are numbers that all of its percentages of the same questions fit.
     """
     every = read_frame(Path(__file__).with_name("published.csv"), (*KEYS, "model", "value", "n", "dataset"))
     return every[every["dataset"] == dataset].drop(columns="dataset")

@@ -189,8 +189,8 @@ def _beside(rows: pd.DataFrame, published: pd.DataFrame) -> dict[str, list[str]]
     for model in PUBLISHED_MODELS:
         cells = rows[[*KEYS]].merge(published[published["model"] == model], "left", [*KEYS])
         if cells["value"].notna().any():
-            pairs = zip(cells["value"], cells["n"], strict=True)
-            columns[f"Published {model} % (n)"] = ["" if pd.isna(v) else f"{v:.2f} ({n:.0f})" for v, n in pairs]
+            both = zip(cells["value"], cells["n"], strict=True)
+            columns[f"Published {model} % (n, ~ inferred)"] = ["" if pd.isna(v) else f"{v:.2f} ({n})" for v, n in both]
     return columns
 
 

@@ -61,7 +61,7 @@ def test_every_figure_is_a_cell_of_its_row(made: Path, committed: bool) -> None:
     page, folders = Page(root / PAGE), {file.parent.name for file in (root / "reports").glob("*/scores.csv")}
     assert folders <= {e.get("id") for e in page.all(kind="chapter")}
     published = rows_of(ROOT / "pipeline" / "report" / "published.csv")
-    printed = [float(row[name]) for row in published for name in ("value", "n") if row[name]]
+    printed = [float(text) for row in published for name in ("value", "n") for text in NUMBER.findall(row[name])]
     files = {file: rows_of(file) for file in (root / "reports").rglob("*.csv")}
     seen: Counter[str] = Counter()
     for row in (e for e in page.all("tr") if re.search(r":\d+$", e.get("data-source", ""))):
