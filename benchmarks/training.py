@@ -21,7 +21,7 @@ PUBLISHED: dict[str, dict[str, tuple[float, float | None, str]]] = {
         "the paper's 13b": (390.0, None, "2 x NVIDIA RTX A6000"),
     },
 }
-"""Minutes, megabytes where it says them, the device: Yu et al. 2024, appendix on training. Ratios are to the first."""
+"""Minutes, megabytes where it says them, the device: Yu et al. 2024, section V-C. Ratios are to the first."""
 
 
 def measure(root: Path) -> list[Row]:

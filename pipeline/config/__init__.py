@@ -217,13 +217,13 @@ class EncoderConfig(Section):
     learning_rate: Rate = 1e-3
     weight_decay: Annotated[float, Field(ge=0, lt=1)] = 0.0
     max_grad_norm: GradNorm = 0.0
-    """Clip gradients to this norm; 0 does not clip (paper, published code)."""
+    """Clip gradients to this norm; 0 does not clip (the published code; the paper does not say)."""
     flip_probability: Annotated[float, Field(ge=0, le=1)] = 0.5
     """Chance of each of the two flips in training."""
     reference: Literal["none", "subtract"] = "none"
     """`subtract`: show each frame's difference to the video's no-contact reference in place of the frame."""
     standardize: bool = False
-    """Shift and scale embeddings to mean 0 and deviation 1 over the training frames (the paper does not)."""
+    """Shift and scale embeddings to mean 0 and deviation 1 over the training frames (the paper names no such step)."""
     embed_batch_size: Positive = 64
     """Frames at a time when embeddings are computed."""
     pretrained: str = Field(default=str(PRETRAINED), exclude=True)

@@ -1,6 +1,6 @@
 """Training of the tactile encoder on property labels.
 
-`paper` and `release` learn visual prompts and heads on a frozen CLIP by gradients (the paper's section III-A); `tuned`
+`paper` and `release` learn visual prompts and heads on a frozen CLIP by gradients (the paper's section IV-A); `tuned`
 fits heads to frozen backbones and then tunes both (`pipeline.encoder.tuned`).
 """
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from pipeline.report.provenance import beyond_paper, provenance
-from pipeline.report.readme import CHANCE, MOST_LINES, finding, render_readme, sections
+from pipeline.report.readme import CHANCE, MOST_LINES, VICUNA, finding, render_readme, sections
 from pipeline.scales import compose
 from pipeline.videos.catalogue import load_catalogue
 from tests.closure import ROOT
@@ -168,6 +169,13 @@ def test_every_setting_that_is_not_papers_is_counted_and_named_in_the_fold() -> 
     begun = beyond_paper(compose("finetune", ["questions.facts=false", "language.start=/home/me/model"], conf), conf)
     assert (begun["language.start"], begun["lora.skip_contradicted"]) == ("model", True)
     assert not {"align.begin_with_words", "language.normalize_touch", "questions.inexact"} & {*begun}
+
+
+def test_the_first_screen_says_that_the_papers_models_were_never_run_until_a_report_has_them() -> None:
+    reports = [json.loads(file.read_text()) for file in (ROOT / "reports").glob("*/provenance.json")]
+    sizes = [said["base_models"]["language"]["parameters"] for said in reports]
+    screen = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split()[:200])
+    assert ("CLIP ViT-L/14 with Vicuna, have never been run here" in screen) == (max(sizes) < VICUNA)
 
 
 def test_what_the_figures_stand_on_is_said_in_words() -> None:
