@@ -98,10 +98,9 @@ def beyond_paper(params: Params, conf: Path) -> dict[str, Any]:
     encoder, start = params.encoder, params.language.start
     void = UNTOLD | ({"begin_with_words", "normalize_touch"} if start else set())
     void |= set() if params.questions.facts else {"inexact"}
-    void |= set() if "scenes" in encoder.backbone else {"pretrain"}
-    void |= set() if "timm" in encoder.backbone else {"feature_stage"}
-    if "clip" not in encoder.backbone:
-        void |= {"prompts", "prompt_layers"} | (set() if encoder.embedding == "logits" else {"embedding"})
+    read = {"scenes": ["pretrain"], "timm": ["feature_stage"], "clip": ["prompts", "prompt_layers", "embedding"]}
+    void |= {key for name, keys in read.items() if name not in encoder.backbone for key in keys}
+    void -= {"embedding"} if encoder.embedding == "logits" else set()
     own, papers = (each.model_dump(mode="json") for each in (params, compose("paper-7b", conf=conf)))
     own["language"]["start"] = named(start)
     return {

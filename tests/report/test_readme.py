@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from pipeline.report.provenance import beyond_paper, provenance
-from pipeline.report.readme import CHANCE, MOST_LINES, VICUNA, finding, render_readme, sections
+from pipeline.report.readme import CHANCE, MOST_LINES, finding, render_readme, sections
 from pipeline.scales import compose
 from pipeline.videos.catalogue import load_catalogue
 from tests.closure import ROOT
@@ -155,27 +154,19 @@ def test_the_base_encoder_is_what_its_backbones_read(tmp_path: Path, backbone: s
 
 
 def test_every_setting_that_is_not_papers_is_counted_and_named_in_the_fold() -> None:
-    conf = ROOT / "conf"
-    assert beyond_paper(compose("paper-7b", [], conf), conf) == beyond_paper(compose("paper-13b", [], conf), conf) == {}
-    rates = {"encoder.learning_rate": 0.5, "lora.rank": 3, "frames.fraction": 0.9, "encoder.flip_probability": 0.25}
-    idle = ("encoder.feature_stage=1", "pretrain.steps=1", "questions.inexact=0.5", "align.micro_batch_size=2")
-    set_so = [f"{key}={value}" for key, value in rates.items()]
-    assert beyond_paper(compose("paper-7b", [*set_so, *idle, "seed=1"], conf), conf) == rates
-    found = beyond_paper(compose("small", ["lora.given=0.7", "pretrain.steps=1"], conf), conf)
-    assert (found["lora.given"], found["questions.restate"], found["pretrain.steps"]) == (0.7, True, 1)
-    assert found["align.begin_with_words"] is found["language.normalize_touch"] is True
+    def beyond(scale: str, *overrides: str) -> dict[str, Any]:
+        return beyond_paper(compose(scale, overrides, ROOT / "conf"), ROOT / "conf")
+
+    idle = ("encoder.feature_stage=1", "pretrain.steps=1", "questions.inexact=0.5", "seed=1")
+    assert beyond("paper-13b", *idle) == {}, "and batches are computed in other parts"
+    assert beyond("paper-7b", "lora.rank=3", "frames.fraction=0.9") == {"frames.fraction": 0.9, "lora.rank": 3}
+    found = beyond("small", "lora.given=0.7", "pretrain.steps=1")
+    assert (found["lora.given"], found["pretrain.steps"], found["align.begin_with_words"]) == (0.7, 1, True)
     assert "encoder.embedding" not in found, "CLIP's alone"
     # The start has its connector, and without facts none is inexact; a place of this machine is not told.
-    begun = beyond_paper(compose("finetune", ["questions.facts=false", "language.start=/home/me/model"], conf), conf)
+    begun = beyond("finetune", "questions.facts=false", "language.start=/home/me/model")
     assert (begun["language.start"], begun["lora.skip_contradicted"]) == ("model", True)
     assert not {"align.begin_with_words", "language.normalize_touch", "questions.inexact"} & {*begun}
-
-
-def test_the_first_screen_says_that_the_papers_models_were_never_run_until_a_report_has_them() -> None:
-    reports = [json.loads(file.read_text()) for file in (ROOT / "reports").glob("*/provenance.json")]
-    sizes = [said["base_models"]["language"]["parameters"] for said in reports]
-    screen = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split()[:200])
-    assert ("CLIP ViT-L/14 with Vicuna, have never been run here" in screen) == (max(sizes) < VICUNA)
 
 
 def test_what_the_figures_stand_on_is_said_in_words() -> None:
@@ -183,11 +174,8 @@ def test_what_the_figures_stand_on_is_said_in_words() -> None:
     found |= {"language.start": "pipeline/pretrained/octopi-small"}
     said = report([], settings="", facts_told=True, intervals="Known to be narrow.", beyond_paper=found)
     assert "its training went on from `octopi-small`, which was trained before" in finding(said)[0]
-    facts = "\n".join(sections(said)["stands_on"])
+    text = render_readme(said, [])
     told = ["2 (a, b), 4 videos, split `paper`", "Nothing is noted", "Known to be narrow.", "ask for touch"]
-    assert all(words in facts for words in (*told, "in 4 settings"))
     fold = "questions: `restate=True`; lora: `dropout=0.0`, `target_modules=[q, k]`; language: `start=pipeline/pre"
-    assert fold in next(line for line in render_readme(said, []).splitlines() if "in 4 settings" in line)
-    same = report([], beyond_paper={})
-    assert "otherwise than" not in "\n".join(sections(same)["stands_on"])
-    assert "<details>" not in render_readme(same, [])
+    assert all(words in text for words in (*told, "in 4 settings", fold))
+    assert "<details>" not in render_readme(report([], beyond_paper={}), []), "nothing is otherwise"

@@ -18,6 +18,7 @@ from pipeline.videos.catalogue import Catalogue
 from tests.conftest import refused
 from tests.report.conftest import effect, report, score
 
+PRINTED = [f"Published {model} % (n, ~ inferred)" for model in ("7b", "13b", "PG-InstructBLIP")]
 BY_KEY = {table.key: table for table in TABLES}
 
 
@@ -72,7 +73,7 @@ def test_each_of_the_papers_tables_changes_one_part_only(key: str, systems: list
     axes = itertools.product(("base", "finetuned"), ("without", "with"), ("none", "needed", "all"))
     shown = build(key, *(score(variant=" ".join(v)) for v in axes), score(seed="0"), score(touch="swapped"))
     assert list(shown["System"]) == systems
-    assert all(shown["Published 7b % (n, ~ inferred)"])
+    assert all(shown[PRINTED[0]])
 
 
 def test_tasks_stand_where_they_belong_whole_answers_first() -> None:
@@ -128,8 +129,7 @@ def test_reports_stand_side_by_side_with_every_row_of_the_paper() -> None:
     reports = {"7b here": small, "13b here": large}
     few = side_by_side(reports, every=False).set_index("Task")
     heads = [f"Measured {name} % [95 %] (n)" for name in reports]
-    printed = [f"Published {model} % (n, ~ inferred)" for model in ("7b", "13b", "PG-InstructBLIP")]
-    assert list(few.columns) == [*printed[:2], *heads]
+    assert list(few.columns) == [*PRINTED[:2], *heads]
     assert list(few.index) == [task_title(task) for task in ("OPD", "PC", "PSS", "POM", "PSR")]
     compared = ["48.10 (~158)", "55.06 (~158)", "50.0 [35.0, 65.0] (40)", "60.0 [40.0, 80.0] (150)"]
     assert list(few.loc["Property Comparison (PC)"]) == compared
@@ -139,7 +139,7 @@ def test_reports_stand_side_by_side_with_every_row_of_the_paper() -> None:
     answered = cells[cells["model"].isin(["7b", "13b", "CLIP"])]
     fruit = every[every["Task"].str.endswith(", avocados")]
     assert len(every) - len(fruit) == len(answered.drop_duplicates(list(KEYS))) == 32
-    pressed = fruit.set_index("System")[printed[1:]].T.to_dict("list")
+    pressed = fruit.set_index("System")[PRINTED[1:]].T.to_dict("list")
     assert len(fruit) == 5
     assert pressed["Octopi (full system): all properties right"] == ["35.50 (200)", "0.00 (200)"]
     assert pressed["Octopi (full system): bumpiness"] == ["64.00 (200)", "9.50 (200)"]
@@ -152,9 +152,8 @@ def test_reports_about_other_data_stand_beside_what_is_published_of_these() -> N
     fruit, paper = report([score("RIPE"), score("PC")], dataset="avocados"), report([score("PC")])
     own = report([score("PC")], dataset="Other")
     rows = side_by_side({"fruit": fruit, "own": own, "paper": paper}, every=False).set_index("Task")
-    printed = [f"Published {m} % (n, ~ inferred)" for m in ("7b", "13b", "PG-InstructBLIP")]
     heads, here = [f"Measured {name} % [95 %] (n)" for name in ("fruit", "own", "paper")], "50.0 [35.0, 65.0] (40)"
-    assert list(rows.columns) == [*printed, *heads]
+    assert list(rows.columns) == [*PRINTED, *heads]
     assert list(rows.loc["Property Comparison (PC)"]) == ["48.10 (~158)", "55.06 (~158)", "", "", "", here]
     assert list(rows.loc["Ripeness Classification (RIPE), avocados"]) == ["", "63.00 (100)", "", here, "", ""]
     assert list(rows.loc["Property Comparison (PC), Other"]) == ["", "", "", "", here, ""]
