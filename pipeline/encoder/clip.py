@@ -2,7 +2,7 @@
 
 Visual prompt tuning is the deep variant (Jia et al. 2022, arXiv 2203.12119) on an unmodified open_clip tower: at each
 transformer layer P learnable tokens join the sequence; the previous layer's outputs at its own prompts are discarded.
-The paper adds "a shared linear layer": each prompt passes through one linear map common to all layers. The published
+The paper adds "a shared linear layer"; here each prompt passes through one map common to all layers. The published
 code has no such map, draws its prompts from N(0, .02), and puts the first layer's in before the tower's first
 normalisation.
 """

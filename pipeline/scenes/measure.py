@@ -30,7 +30,7 @@ VISIBLE_MM = 0.03
 """Least prominence of a protrusion in the skin: over a flank of 1 mm it changes the light by some four 8-bit steps, a
 few times the camera's noise."""
 BIG_SHARE = 1 / 4
-"""The paper's border between small and big bumps, as a share of the image's height."""
+"""The paper's border between small and big bumps, 1/4 of the tactile image, taken as a share of its height."""
 HALF, CAP = 0.5, math.sqrt(2)
 """Sections are taken at half height, where neighbours do not run into each other; a paraboloid's foot is CAP
 as wide."""

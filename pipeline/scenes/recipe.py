@@ -32,7 +32,7 @@ ROUGH_RMS_MM: tuple[Range, ...] = ((0.0003, 0.001), (0.007, 0.01), (0.028, 0.04)
 ROUGH_LONGEST_MM: Range = (0.4, 0.6)
 """Its longest wavelength, below what counts as shape (`measure.TEXTURE_MM`)."""
 BUMP_SHARE: tuple[Range, ...] = ((0.0, 0.0), (0.15, 0.19), (0.45, 0.6))
-"""Width of a bump by bumpiness, as a share of the image's height; the paper's border is 1/4."""
+"""Width of a bump by bumpiness, as a share of the image's height; the paper's border is 1/4 of the image."""
 BUMP_STEEPNESS: Range = (0.14, 0.19)
 """Height of a bump over its width."""
 RADII_MM: dict[str, tuple[Range, Range]] = {

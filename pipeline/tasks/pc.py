@@ -52,7 +52,7 @@ def read(answer: str) -> Reading | None:
 
 
 class PropertyComparison(TaskDefinition):
-    """Three answers are possible (yes, no, the same), hence the paper's chance of one third."""
+    """Three answers are possible (yes, no, the same), which fits the paper's chance of one third."""
 
     name = "PC"
     title = "Property Comparison"
