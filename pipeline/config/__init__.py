@@ -163,9 +163,10 @@ class QuestionsConfig(Section):
     scenarios: Literal["published", "ours"] = "published"
     """Whose reading of the situations decides which objects are right in scenario questions (PSR): the published
     code's, or this project's, which has clearer contrasts. A catalogue's own scenarios are always asked."""
-    wording: Literal["object", "class"] = "object"
+    wording: Literal["object", "class", "texts"] = "object"
     """Wording of free descriptions. `object`: each object has one phrase per class, as published. `class`: every object
-    has its class's first phrase: with several, greedy decoding splits a class's probability among them."""
+    has its class's first phrase: with several, greedy decoding splits a class's probability among them. `texts`: what
+    the catalogue's texts.csv says, one text drawn for each question; where it is silent, as `object`."""
     facts: bool = False
     """Begin matching questions with what the named objects are like, for a language model that has never heard of
     them: then no knowledge of the world is asked for. Tables say so."""

@@ -83,21 +83,22 @@ def build_questions(
         rng, order, turns = (
             random.Random(derive_seed(seed, pool.part, task, *purpose)) for purpose in ((), ("facts",), ("turns",))
         )
-        for number, draft in enumerate(islice(_drafts(definition, pool, rng, distinct), count)):
+        pools = (replace(pool, catalogue=pool.catalogue.telling(seed, pool.part, task, n)) for n in range(count))
+        for number, (told, draft) in enumerate(islice(_drafts(definition, pools, rng, distinct), count)):
             asked_on = turns.random() < two_turns and len(draft.videos) > 1
-            more = further(definition, pool, draft, turns) if asked_on else []
+            more = further(definition, told, draft, turns) if asked_on else []
             if not asked_on and turns.random() < plainly:
-                draft = definition.plainly(draft, pool.catalogue, turns)
+                draft = definition.plainly(draft, told.catalogue, turns)
             if restate:
-                draft, *more = (definition.restated(d, pool.catalogue) for d in (draft, *more))
+                draft, *more = (definition.restated(d, told.catalogue) for d in (draft, *more))
             if asked_on:
-                choices = (definition.as_choice(d, pool.catalogue) for d in (draft, *more))
+                choices = (definition.as_choice(d, told.catalogue) for d in (draft, *more))
                 # Shuffled among the turns: a choice may then follow the descriptions directly, as a scenario question
                 # does.
                 more += islice(filter(None, choices), CHOICES)
-                draft = in_turns(draft, turns.sample(more, len(more)), pool.catalogue)
+                draft = in_turns(draft, turns.sample(more, len(more)), told.catalogue)
             if facts:
-                draft = definition.with_facts(draft, pool.catalogue, order, inexact)
+                draft = definition.with_facts(draft, told.catalogue, order, inexact)
             questions.append(draft.numbered(f"{task}-{place}-{number:05d}", task, pool.part))
     random.Random(derive_seed(seed, pool.part, "order")).shuffle(questions)
     return questions
@@ -115,8 +116,11 @@ def further(definition: TaskDefinition, pool: Pool, draft: Draft, rng: random.Ra
     return rng.sample(more, len(more))
 
 
-def _drafts(definition: TaskDefinition, pool: Pool, rng: random.Random, distinct: bool) -> Iterator[Draft]:
-    """Questions of all strata by turns, until no stratum yields one that is new."""
+def _drafts(
+    definition: TaskDefinition, pools: Iterator[Pool], rng: random.Random, distinct: bool
+) -> Iterator[tuple[Pool, Draft]]:
+    """Questions of all strata by turns, each from its own pool, until no stratum yields one that is new."""
+    pool = next(pools)
     live = list(range(definition.strata(pool.catalogue)))
     rng.shuffle(live)
     seen: set[tuple[object, ...]] = set()
@@ -125,15 +129,16 @@ def _drafts(definition: TaskDefinition, pool: Pool, rng: random.Random, distinct
             for draft in (definition.draft(pool, stratum, rng) for _ in range(ATTEMPTS)):
                 if draft is None:
                     continue
-                # Another template does not make a new question about the same videos and properties; another scenario
-                # does.
+                # Another template or text does not make a new question about the same videos and properties; another
+                # scenario does.
                 last = draft.dialogues[-1].turns[-1]
                 situation = last.user if "{tactile}" not in last.user else ""
-                key = (draft.videos, draft.gold.properties, last.assistant, situation)
+                key = (draft.videos, draft.gold, situation)
                 if distinct and key in seen:
                     continue
                 seen.add(key)
-                yield draft
+                yield pool, draft
+                pool = next(pools)
                 break
             else:
                 live.remove(stratum)

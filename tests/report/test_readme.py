@@ -157,7 +157,7 @@ def test_every_setting_that_is_not_papers_is_counted_and_named_in_the_fold() -> 
     def beyond(scale: str, *overrides: str) -> dict[str, Any]:
         return beyond_paper(compose(scale, overrides, ROOT / "conf"), ROOT / "conf")
 
-    idle = ("encoder.feature_stage=1", "pretrain.steps=1", "questions.inexact=0.5", "seed=1")
+    idle = ("encoder.feature_stage=1", "pretrain.steps=1", "questions.inexact=0.5", "questions.wording=texts", "seed=1")
     assert beyond("paper-13b", *idle) == {}, "and batches are computed in other parts"
     assert beyond("paper-7b", "lora.rank=3", "frames.fraction=0.9") == {"frames.fraction": 0.9, "lora.rank": 3}
     found = beyond("small", "lora.given=0.7", "pretrain.steps=1")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections import Counter
+import re
+from collections import Counter, defaultdict
 from statistics import fmean
 
 import numpy as np
@@ -121,6 +122,36 @@ def test_facts_stand_before_the_same_matching_questions() -> None:
         first = [facts.index(f" {CATALOGUE.objects[o].name}.") for o in question.objects]
         orders.add(tuple(sorted(range(3), key=first.__getitem__)))
     assert len(orders) == 6, "the order of the facts gives nothing away"
+
+
+def test_texts_stand_in_place_of_phrases_and_change_nothing_else() -> None:
+    texts = {o: tuple(f"Text {n} of {o}." for n in range(3)) for o in sorted(CATALOGUE.objects)[::2]}
+    catalogue = Catalogue(language=CATALOGUE.language, objects=CATALOGUE.objects, texts=texts)
+    drawn = defaultdict(set)
+    for part, more in ((Part.TEST, {}), (Part.TRAIN, {"two_turns": 0.4, "restate": True})):
+        told, again, plain = (
+            build_questions(pool_of(part, ASSIGNMENTS, c), COUNTS, seed=1, distinct=part is Part.TEST, **more)
+            for c in (catalogue, catalogue, CATALOGUE)
+        )
+        assert told == again
+        for question, other in zip(told, plain, strict=True):
+            own = set(re.findall(r"Text (\d) of (\w+)\.", written(question)))
+            assert sorted(o for _, o in own) == sorted(texts.keys() & set(question.objects)), "one text an object"
+            said = re.sub(r"Text \d of (\w+)\.", lambda m: CATALOGUE.unstructured(m[1]), written(question))
+            assert said == written(other)
+            for number, o in own:
+                drawn[o].add(number)
+    assert min(map(len, drawn.values())) > 1, "not always the same"
+
+
+def written(question: Question) -> str:
+    """All of a question; of each turn, what counts as description and the rest."""
+    turns = [
+        (d.opd, t.user, t.assistant[: t.described], t.assistant[t.described :])
+        for d in question.dialogues
+        for t in d.turns
+    ]
+    return "\n".join([question.model_copy(update={"dialogues": ()}).model_dump_json(), *map(" | ".join, turns)])
 
 
 def test_inexact_facts_leave_the_right_matching_the_nearest() -> None:

@@ -81,12 +81,15 @@ SHORT = "object_id,name,hardness,roughness,bumpiness"
 BALL = "ball,a ball,1 1 2,0,0 0 1"
 
 
-def write(folder: Path, *lines: str, described: Sequence[str] = (), encoding: str = "utf-8") -> Path:
+def write(
+    folder: Path, *lines: str, described: Sequence[str] = (), texts: Sequence[str] = (), encoding: str = "utf-8"
+) -> Path:
     """A catalogue with PhysiCLeAR's language and these lines."""
     shutil.copy(PHYSICLEAR / "properties.yaml", folder)
     (folder / "objects.csv").write_text("\n".join(lines) + "\n", encoding=encoding)
-    if described:
-        (folder / "descriptions.csv").write_text("\n".join(described) + "\n", encoding=encoding)
+    for file, told in (("descriptions.csv", described), ("texts.csv", texts)):
+        if told:
+            (folder / file).write_text("\n".join(told) + "\n", encoding=encoding)
     return folder
 
 
@@ -135,6 +138,32 @@ def test_a_bad_table_is_one_clear_line(tmp_path: Path, lines: list[str], words: 
 def test_a_bad_description_is_one_clear_line(tmp_path: Path, described: list[str], words: str) -> None:
     with refused(rf"descriptions\.csv.*{words}"):
         load_catalogue(write(tmp_path, SHORT, BALL, described=described))
+
+
+@pytest.mark.parametrize(
+    ("texts", "words"),
+    [
+        (["object_id,description", "ball,round"], "text.*missing"),
+        (["object_id,text", "ball,Round.", "balll,Round."], r"line 3.*'balll'.*objects\.csv"),
+        (["object_id,text", "ball,"], "line 2.*text is empty"),
+        (["object_id,text", '"ball","Round. Overall, it presents a hard surface."'], "line 2.*'Overall'"),
+    ],
+)
+def test_a_bad_text_is_one_clear_line(tmp_path: Path, texts: list[str], words: str) -> None:
+    with refused(rf"texts\.csv.*{words}"):
+        load_catalogue(write(tmp_path, SHORT, BALL, texts=texts))
+
+
+def test_texts_are_told_where_they_are_asked_for_and_packed_nowhere(tmp_path: Path) -> None:
+    bowl = BALL.replace("ball,a ball", "bowl,a bowl")
+    with refused(r"questions\.wording=texts.*texts\.csv"):
+        load_catalogue(write(tmp_path, SHORT, BALL, bowl)).asking("published", "texts")
+    loaded = load_catalogue(write(tmp_path, SHORT, BALL, bowl, texts=["object_id,text", "ball,Round.", "ball,Odd."]))
+    told, phrases = (loaded.asking("published", wording).called("number") for wording in ("texts", "object"))
+    assert told.describe("ball") == f"Round. {loaded.structured((1, 0, 0))}"
+    assert told.describe("bowl") == phrases.describe("bowl")
+    assert phrases.describe("ball").startswith("The surface feels ")
+    assert Catalogue.model_validate(told.model_dump()) == phrases
 
 
 def test_a_table_of_what_is_needed_alone_will_do(tmp_path: Path) -> None:

@@ -1,8 +1,8 @@
 """The catalogue of a data set: its properties, its objects, the annotators' ratings and the words for all of it.
 
-A catalogue is a folder with `objects.csv` and `properties.yaml`, and, where its publishers described the objects,
-`descriptions.csv` (docs/data.md explains every column and key). The one in pipeline/physiclear is PhysiCLeAR's, from
-the tables of the paper (names, ratings, materials, parts, splits).
+A catalogue is a folder with `objects.csv` and `properties.yaml`. Where its publishers described the objects, there are
+`descriptions.csv` for the audit and `texts.csv` to train on (docs/data.md explains every column and key).
+The one in pipeline/physiclear is PhysiCLeAR's, from the tables of the paper (names, ratings, materials, parts, splits).
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from pathlib import Path
 from typing import Literal
 
 import yaml
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from pipeline.core.errors import UserError, first_problem
 from pipeline.core.records import Part, Record
 from pipeline.core.runtime import derive_seed
 from pipeline.videos.catalogue.csv_reader import Row, read_rows
-from pipeline.videos.catalogue.wording import Language, Property, Scenario
+from pipeline.videos.catalogue.wording import OPENING, Language, Property, Scenario
 
 __all__ = ["RULED_SPLITS", "Catalogue", "Language", "Object", "Property", "Scenario", "load_catalogue"]
 
-OBJECTS, PROPERTIES, DESCRIPTIONS = "objects.csv", "properties.yaml", "descriptions.csv"
+OBJECTS, PROPERTIES, DESCRIPTIONS, TEXTS = "objects.csv", "properties.yaml", "descriptions.csv", "texts.csv"
 RULED_SPLITS = ("development", "kfold")
 """Splits that are made by rule; no column may bear their names."""
 
@@ -59,6 +59,8 @@ class Catalogue(Record):
 
     language: Language
     objects: dict[str, Object]
+    texts: dict[str, tuple[str, ...]] = Field({}, exclude=True)
+    """By object id, free descriptions that stand in place of those put together from phrases; the first is told."""
 
     @cached_property
     def properties(self) -> tuple[Property, ...]:
@@ -78,8 +80,13 @@ class Catalogue(Record):
     def asking(self, source: str, wording: str = "object") -> Catalogue:
         """The catalogue as questions take it: with the scenarios that are from a source (`Scenario.source`) or none.
 
-        The wording `class` keeps only the first phrase of each class.
+        The wording `class` keeps only the first phrase of each class; `texts` alone keeps the texts.
+
+        Raises:
+            UserError: for the wording `texts`, where there are none.
         """
+        if wording == "texts" and not self.texts:
+            raise UserError(f"questions.wording=texts: data.catalogue has no {TEXTS} with a text; see docs/data.md")
         scenarios = tuple(s for s in self.language.scenarios if s.source in ("", source))
         properties = self.language.properties
         if wording == "class":
@@ -88,7 +95,12 @@ class Catalogue(Record):
             properties = tuple(p.model_copy(update={"phrases": phrases}) for p, phrases in worded)
         language = self.language.model_copy(update={"scenarios": scenarios, "properties": properties})
         # Not a copy of this one: its cached properties would come along.
-        return Catalogue(language=language, objects=self.objects)
+        return Catalogue(language=language, objects=self.objects, texts=self.texts if wording == "texts" else {})
+
+    def telling(self, *question: object) -> Catalogue:
+        """The catalogue as one question has it: of each object's texts one, drawn by what identifies the question."""
+        drawn = {o: (texts[derive_seed("text", *question, o) % len(texts)],) for o, texts in self.texts.items()}
+        return self.model_copy(update={"texts": drawn}) if drawn else self
 
     def called(self, names: Literal["catalogue", "number"]) -> Catalogue:
         """The catalogue with its objects' names as `questions.names` has them; numbers in the order of ids."""
@@ -96,7 +108,7 @@ class Catalogue(Record):
             return self
         numbered = enumerate(sorted(self.objects.items()))
         objects = {key: o.model_copy(update={"name": f"object {number}"}) for number, (key, o) in numbered}
-        return Catalogue(language=self.language, objects=objects)
+        return Catalogue(language=self.language, objects=objects, texts=self.texts)
 
     def labels(self, object_id: str) -> tuple[int, ...]:
         """The class of each property of one object."""
@@ -112,7 +124,9 @@ class Catalogue(Record):
         return self.language.structured.format(**words)
 
     def unstructured(self, object_id: str) -> str:
-        """The object's own free description; each property's wording is fixed by the object's id."""
+        """The object's own free description: its text, or phrases of its classes, fixed by the object's id."""
+        if object_id in self.texts:
+            return self.texts[object_id][0]
         words = {}
         for p, level in zip(self.properties, self.labels(object_id), strict=True):
             choices = p.phrases[level]
@@ -131,7 +145,7 @@ class Catalogue(Record):
 
 
 def load_catalogue(folder: Path) -> Catalogue:
-    """Read `properties.yaml`, `objects.csv` and, where it is there, `descriptions.csv` of a folder.
+    """Read `properties.yaml`, `objects.csv` and, where they are there, `descriptions.csv` and `texts.csv` of a folder.
 
     What is wrong is a UserError that names the file, line and mend.
     """
@@ -165,9 +179,9 @@ def load_catalogue(folder: Path) -> Catalogue:
                 f"{where}: {entry.name!r} is also the name of {twin}; give each object a name of its own, since "
                 "matching questions tell objects apart by name"
             )
-    for object_id, text in _read_descriptions(folder / DESCRIPTIONS, objects).items():
+    for object_id, (text,) in _read_texts(folder / DESCRIPTIONS, "description", objects).items():
         objects[object_id] = objects[object_id].model_copy(update={"description": text})
-    return Catalogue(language=language, objects=objects)
+    return Catalogue(language=language, objects=objects, texts=_read_texts(folder / TEXTS, "text", objects))
 
 
 def _split_columns(file: Path, header: Sequence[str], language: Language) -> dict[str, str]:
@@ -229,15 +243,20 @@ def _classes(text: str, most: int) -> tuple[int, ...]:
     return values if len(values) == len(words) and all(v <= most for v in values) else ()
 
 
-def _read_descriptions(file: Path, objects: dict[str, Object]) -> dict[str, str]:
-    """Object id to its publishers' description; nothing where there is no such file."""
-    described: dict[str, str] = {}
-    rows = read_rows(file, ["object_id", "description"])[1] if file.is_file() else []
+def _read_texts(file: Path, column: str, objects: dict[str, Object]) -> dict[str, tuple[str, ...]]:
+    """Object id to what a column says of it: one `description`, any number of `text`; nothing without the file."""
+    found: dict[str, tuple[str, ...]] = {}
+    rows = read_rows(file, ["object_id", column])[1] if file.is_file() else []
     for where, row in rows:
         object_id = row["object_id"]
         if object_id not in objects:
             raise UserError(f"{where}: {object_id!r} is not in {file.with_name(OBJECTS)}; correct or remove the line")
-        if object_id in described:
+        if column == "description" and object_id in found:
             raise UserError(f"{where}: {object_id} is described twice; keep one line an object")
-        described[object_id] = row["description"]
-    return described
+        if column == "text" and (not row[column] or re.search(rf"\b{OPENING}\b", row[column])):
+            raise UserError(
+                f"{where}: text is empty or has a sentence with {OPENING!r}; write what comes before that closing "
+                "sentence, which the ratings make"
+            )
+        found[object_id] = (*found.get(object_id, ()), row[column])
+    return found
