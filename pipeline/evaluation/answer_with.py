@@ -13,7 +13,7 @@ import json
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -36,8 +36,8 @@ from pipeline.training.sampling import sample_evaluation
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.frames.store import FrameStore, frames_key
 
-Show = Callable[[str, str], list[str]]
-"""From a video's and its object's name to the pictures that stand for it, as data URLs."""
+Show = Callable[[str], list[str]]
+"""From a video's id to the pictures that stand for it, as data URLs."""
 
 CACHE_FILE = "cache.jsonl"
 PHOTO_SUFFIXES = (".jpeg", ".jpg", ".png", ".webp")
@@ -108,7 +108,8 @@ def ask_all(
         params: Whose questions, seeds and frames.
         folder: Folder of the kept frames, or of the photos: for each object `<object>.jpg` or a folder `<object>/`.
         limit: Most requests of this call, not counting what the client sends again; None: no limit.
-        published: Only describe, by the paper's three prompts; the folder's name then ends with -published.
+        published: Only describe, by the paper's three prompts, from one photo a video where photos are shown; the
+            folder's name then ends with -published.
 
     Raises:
         UserError: where the catalogue has other properties than the published prompts, an input is missing, or the
@@ -123,9 +124,10 @@ def ask_all(
             asked = {seed: read_jsonl(file, Question) for seed, file in files.items()}
             if published:
                 asked = {seed: [q for q in questions if q.task == "OPD"] for seed, questions in asked.items()}
-            objects = sorted({o for questions in asked.values() for q in questions for o in q.objects})
-            most = params.frames.per_video
-            show = _frames(folder, most) if shown is Shown.FRAMES else _photos(folder, objects, most)
+            every = chain.from_iterable(asked.values())
+            touched = {v: o for q in every for v, o in zip(q.videos, q.objects, strict=True)}
+            most = 1 if published and shown is Shown.PHOTOS else params.frames.per_video
+            show = _frames(folder, most) if shown is Shown.FRAMES else _photos(folder, touched, most)
             catalogue = load_catalogue(Path(params.data.catalogue)).called(params.questions.names)
             if published and [(p.name, len(p.levels)) for p in catalogue.properties] != [(n, 3) for n in PUBLISHED]:
                 raise UserError(
@@ -209,12 +211,12 @@ def _answer(question: Question, told: str, asker: _Asker, show: Show) -> Predict
     assert dialogue is not None, "every task has this mode"
     messages: list[dict[str, Any]] = []
     replies: list[Reply] = []
-    touched = iter(zip(question.videos, question.objects, strict=True))
+    touched = iter(question.videos)
     for turn in dialogue.turns:
         first, *others = (turn.user if messages else told + turn.user).split("{tactile}")
         content: list[dict[str, Any]] = [{"type": "text", "text": first}]
         for text in others:
-            content += map(_picture, show(*next(touched)))
+            content += map(_picture, show(next(touched)))
             content += [{"type": "text", "text": text}] if text else []
         messages.append({"role": "user", "content": content})
         reply = asker.ask(messages)
@@ -231,8 +233,7 @@ def _answer(question: Question, told: str, asker: _Asker, show: Show) -> Predict
 
 def _classify(question: Question, catalogue: Catalogue, asker: _Asker, show: Show) -> Prediction | None:
     """Ask the published prompts about one object, and word the replies as a description; other replies stay unknown."""
-    ((video, object_id),) = zip(question.videos, question.objects, strict=True)
-    pictures = [*map(_picture, show(video, object_id))]
+    pictures = [*map(_picture, show(*question.videos))]
     told, replies = {}, []
     for prop in catalogue.properties:
         choices, classes = PUBLISHED[prop.name]
@@ -383,7 +384,7 @@ def _frames(folder: Path, most: int) -> Show:
     store = FrameStore(folder)
 
     @lru_cache(maxsize=64)
-    def show(video_id: str, object_id: str) -> list[str]:
+    def show(video_id: str) -> list[str]:
         count = len(store.rows(video_id))
         if not count:
             raise UserError(f"{folder}: no frame of {video_id}; run `dvc repro extract_frames`")
@@ -393,10 +394,13 @@ def _frames(folder: Path, most: int) -> Show:
     return show
 
 
-def _photos(folder: Path, objects: Sequence[str], most: int) -> Show:
-    """Photos of an object, upright. They are encoded anew, so that no EXIF data (such as the place) leaves."""
+def _photos(folder: Path, touched: Mapping[str, str], most: int) -> Show:
+    """Photos of the object that was touched in a video, upright; with `most` 1, each of its videos gets the next one.
+
+    They are encoded anew, so that no EXIF data (such as the place) leaves.
+    """
     found: dict[str, list[Path]] = {}
-    for name in objects:
+    for name in sorted({*touched.values()}):
         # Those named after it, and those in the folder of its name.
         files = chain(folder.glob(f"{name}.*"), (folder / name).glob("[!.]*"))
         found[name] = sorted(f for f in files if f.suffix.lower() in PHOTO_SUFFIXES)
@@ -406,19 +410,21 @@ def _photos(folder: Path, objects: Sequence[str], most: int) -> Show:
         raise UserError(f"{folder}: no photo of {name}{others}; put {name}.jpg or a folder {name}/ there ({kinds})")
 
     @lru_cache(maxsize=64)
-    def of_object(object_id: str) -> list[str]:
-        urls, files = [], found[object_id]
-        for file in (files[i] for i in sorted(set(sample_evaluation(len(files), most)))):
-            data = np.fromfile(file, np.uint8)
-            # OpenCV turns it as its camera noted that it was held.
-            photo = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-            if photo is None:
-                raise UserError(f"{file}: not a picture that can be read; replace it")
-            scale = min(1.0, LONGEST / max(photo.shape[:2]))
-            urls.append(_url(cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), "jpeg"))
-        return urls
+    def read(file: Path) -> str:
+        data = np.fromfile(file, np.uint8)
+        # OpenCV turns it as its camera noted that it was held.
+        photo = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+        if photo is None:
+            raise UserError(f"{file}: not a picture that can be read; replace it")
+        scale = min(1.0, LONGEST / max(photo.shape[:2]))
+        return _url(cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), "jpeg")
 
-    return lambda video_id, object_id: of_object(object_id)
+    def show(video_id: str) -> list[str]:
+        files, own = found[touched[video_id]], sorted(v for v, o in touched.items() if o == touched[video_id])
+        places = sorted({*sample_evaluation(len(files), most)}) if most > 1 else [own.index(video_id) % len(files)]
+        return [read(files[i]) for i in places]
+
+    return show
 
 
 def _url(picture: cv2.typing.MatLike, kind: str) -> str:

@@ -428,6 +428,17 @@ def test_photos_stand_in_place_of_the_videos_of_their_objects(project: Path, pho
     assert all(s.shown is Shown.PHOTOS and s.correct for s in graded())
 
 
+def test_the_published_prompts_show_each_sample_a_photo_of_its_own(project: Path, photos: Path, server: Server) -> None:
+    """Of the first object there are seven photos, which differ in height."""
+    one, name = next(q for q in asked() if q.task == "OPD"), min(o for q in asked() for o in q.objects)
+    order = (4, 0, 1, 2, 6, 5, 3)
+    of_one = [{"question_id": str(n), "videos": (f"{name}_{n}",), "objects": (name,)} for n in order]
+    write_jsonl(Path("data/questions/0/evaluation.jsonl"), [one.model_copy(update=own) for own in of_one])
+    run(server, str(photos), "--prompt", "published", shown="photos")
+    pictures = [shown_in(body["messages"][0]["content"])[1] for body in server.bodies[::3]]
+    assert [[p.height - 8 for p in found] for (found,) in pictures] == [[n] for n in order]
+
+
 def test_photos_that_lack_or_cannot_be_read(project: Path, photos: Path, server: Server) -> None:
     objects = sorted({o for q in asked() for o in q.objects})
     bad = photos / f"{objects[1]}.JPG"
