@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
@@ -160,8 +160,9 @@ def dataset_frame(
     catalogue: Catalogue, videos: Sequence[Video], splits: Sequence[Sequence[Assignment]]
 ) -> pd.DataFrame:
     """The paper's tables about its data set: one row per class, per combination of classes (that an object has or the
-    paper counts), and per figure of lengths.
+    paper counts), per number of videos that an object has, per property that is annotated, and per figure of lengths.
 
+    `percent` is the share of all objects. An annotation is, as the paper counts, one rater's class of one video.
     Of several splits, an object counts in each part that any of them puts it in.
     Published figures stand beside where the catalogue is the paper's, joined by (table, row).
     """
@@ -170,10 +171,10 @@ def dataset_frame(
     levels = [p.levels for p in catalogue.properties]
     labels = [catalogue.labels(o) for o in catalogue.objects]
     classes = [[words[n] for n in own] for words, *own in zip(levels, *labels, strict=True)]
-    filmed = {v.object_id for v in videos}
+    filmed = Counter(v.object_id for v in videos)
     parts = {(a.object_id, a.part) for assignments in splits for a in assignments}
     counted = ["objects", "with_videos", Part.TRAIN, Part.VALIDATION, Part.TEST]
-    counts = [[1, o in filmed, *((o, part) in parts for part in counted[2:])] for o in catalogue.objects]
+    counts = [[1, filmed[o] > 0, *((o, part) in parts for part in counted[2:])] for o in catalogue.objects]
     objects = pd.DataFrame(counts, columns=[str(name) for name in counted]).astype("Int64")
     # By property and for all of them: what each object is, and what it can be.
     groups: list[tuple[str, str, list[str], list[str]]] = [
@@ -182,19 +183,27 @@ def dataset_frame(
     ]
     have, every = ([", ".join(words) for words in them] for them in (zip(*classes, strict=True), product(*levels)))
     found = []
-    for table, before, own, names in (*groups, ("property_combinations", "", have, every)):
+    groups.append(("property_combinations", "", have, every))
+    numbers = [str(n) for n in sorted({*filmed.values()})]
+    groups.append(("videos_per_object", "", [str(filmed[o]) for o in catalogue.objects], numbers))
+    for table, before, own, names in groups:
         rows = objects.groupby(own).sum().reindex(names, fill_value=0)
         beside = [values.get((table, name)) for name in names]
-        rows = rows.assign(table=table, row=[before + name for name in names], frames=None, published=beside)
+        share = (100 * rows["objects"] / len(objects)).round(2)
+        rows = rows.assign(table=table, row=[before + name for name in names], percent=share, published=beside)
         found.append(rows[(rows["objects"] > 0) | rows["published"].notna() | (table == "property_counts")])
     if videos:
+        rated = [sum(len(catalogue.objects[v.object_id].ratings[i]) for v in videos) for i in range(len(levels))]
+        rows = pd.DataFrame({"row": catalogue.property_names, "annotations": rated})
+        found.append(rows.astype({"annotations": "Int64"}).assign(table="annotations"))
         lengths = [v.frames for v in videos]
         figures = {"average": fmean(lengths), "median": median(lengths)}
         figures |= {"minimum": float(min(lengths)), "maximum": float(max(lengths))}
         rows = pd.DataFrame({"row": [*figures], "frames": [*figures.values()]})
         beside = [values.get(("video_lengths", row)) for row in figures]
         found.append(rows.assign(table="video_lengths", published=beside))
-    return pd.concat(found)[["table", "row", *objects, "frames", "published"]]
+    order = ["table", "row", "objects", "percent", *objects.columns[1:], "annotations", "frames", "published"]
+    return pd.concat(found).reindex(columns=order)
 
 
 def confusion_frame(by_seed: Mapping[int, Sequence[Classification]], catalogue: Catalogue) -> pd.DataFrame:

@@ -46,6 +46,8 @@ BESIDE = {
 DATASET = {
     "property_counts": "Property categories: objects a class",
     "property_combinations": "Property combinations: objects each",
+    "videos_per_object": "Videos an object: objects that have so many",
+    "annotations": "Annotations: raters of each video, as those of its object",
     "video_lengths": "Video lengths, in frames that decode",
 }
 """The tables of dataset.csv."""
@@ -150,9 +152,9 @@ def data_tables(folder: Path, dataset: str) -> Iterator[Block]:
         shown = pd.DataFrame({"": rows["item"], "Measured": rows["measured"]})
         if len(printed):
             shown["Published"] = rows["item"].map(printed.map("{:.3f}".format))
-        yield Block(
-            "annotator_agreement", "Annotator agreement, ICC(3,k) with its 95 % interval", "", shown, "audit.csv"
-        )
+        title = "Annotator agreement, ICC(3,k) with its 95 % interval"
+        said = "Above 0.75 it counts as good or excellent, as the paper says."
+        yield Block("annotator_agreement", title, said, shown, "audit.csv")
     if len(audit):
         # Counted by check, with what needs attention first.
         rank = {"error": 0, "warning": 1, "info": 2}

@@ -34,8 +34,9 @@ ARCHITECTURES = {
     "tf_efficientnet_lite0": "EfficientNet-Lite0",
 }
 UNTOLD = {
-    *("scale", "seed", "data", "invent", "scenes", "split", "cross_validation", "ablation", "shipped", "packaged"),
-    *("tracking", "runtime", "weights", "evaluation", "micro_batch_size", "embed_batch_size", "generation_batch_size"),
+    *("scale", "seed", "kernels", "data", "invent", "scenes", "split", "cross_validation", "ablation", "shipped"),
+    *("packaged", "tracking", "runtime", "weights", "evaluation"),
+    *("micro_batch_size", "embed_batch_size", "generation_batch_size"),
 }
 """Sections and keys of params.yaml that change no result, or that other facts of a report are about."""
 

@@ -15,7 +15,7 @@ from pipeline.report.load import KEYS, load_report, published, read_frame
 from pipeline.report.tables import FIVE_TASKS, SHIPPED_TABLE, TABLES, headline, side_by_side, task_title
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import Catalogue
-from tests.conftest import refused
+from tests.conftest import fake_videos, refused
 from tests.report.conftest import effect, report, score
 
 PRINTED = [f"Published {model} % (n, ~ inferred)" for model in ("7b", "13b", "PG-InstructBLIP")]
@@ -50,6 +50,14 @@ def test_all_of_the_papers_combinations_stand_beside_the_ratings(catalogue: Cata
     other = catalogue.model_copy(update={"language": catalogue.language.model_copy(update={"dataset": "another"})})
     own = dataset_frame(other, [], []).set_index("table").loc["property_combinations"]
     assert own["objects"].min() > 0, "of four properties of five classes there would be 625"
+
+
+def test_the_papers_videos_give_its_annotations(catalogue: Catalogue) -> None:
+    numbers = zip(catalogue.objects, [5] * 42 + [6] * 26 + [7] * 6, strict=True)
+    videos = [video for o, number in numbers for video in fake_videos([o], number)]
+    rows = dataset_frame(catalogue, videos, []).set_index(["table", "row"])
+    assert dict(rows.loc["videos_per_object"]["objects"]) == {"5": 42, "6": 26, "7": 6}
+    assert [*rows.loc["annotations"]["annotations"]] == [3 * 408] * 3, "by three raters: the paper's over 1,200"
 
 
 def test_effects_are_written_in_points_and_what_is_unknown_is_empty() -> None:
