@@ -59,7 +59,7 @@ class Catalogue(Record):
 
     language: Language
     objects: dict[str, Object]
-    texts: dict[str, tuple[str, ...]] = Field({}, exclude=True)
+    texts: dict[str, tuple[str, ...]] = Field(default={}, exclude=True)
     """By object id, free descriptions that stand in place of those put together from phrases; the first is told."""
 
     @cached_property
