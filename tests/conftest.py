@@ -219,6 +219,7 @@ def encode(
     milliseconds: Sequence[int] = (),
     bits: int = 0,
     transfer: int = 0,
+    aspect: Fraction = Fraction(1),
 ) -> Path:
     """Write frames (in PyAV's format `given`) by any codec, at any time stamps; FFV1 gives back what went in.
 
@@ -227,7 +228,7 @@ def encode(
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=25)
-        stream.pix_fmt = pixels
+        stream.pix_fmt, stream.codec_context.sample_aspect_ratio = pixels, aspect
         if bits:
             stream.bit_rate = bits
         if transfer:

@@ -26,7 +26,7 @@ from pathlib import Path
 import av
 
 from pipeline.core.errors import UserError
-from pipeline.videos.decoding import CONTAINERS, SUFFIXES
+from pipeline.videos.decoding import CONTAINERS, SUFFIXES, video_stream
 
 DATA_URI = re.compile(r"data:[\w.+/-]*(?:;[\w.+/=-]+)*;base64,", re.ASCII)
 SUFFIX = {b"RIFF": ".avi", b"\x1aE\xdf\xa3": ".mkv"}
@@ -157,19 +157,17 @@ def check(path: Path, limits: Limits) -> None:
     try:
         # FFmpeg decodes the first frames to know their form; it may not take memory for more than these pixels.
         with av.open(str(path), options={**CONTAINERS, "max_pixels": str(limits.pixels)}) as container:
-            if len(container.streams.video) != 1:
-                raise Refused(f"holds {len(container.streams.video)} video streams; send one")
-            stream = container.streams.video[0]
+            stream = video_stream(container)
             promised = max(stream.frames, len(stream.index_entries))
             seconds = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else 0.0
             if promised > limits.frames or seconds > limits.seconds:
                 raise too_long
-            if not 0 < stream.width * stream.height <= limits.pixels:
+            if not all(0 < each.width * each.height <= limits.pixels for each in container.streams.video):
                 message = f"frames are damaged or have more than {limits.pixels} pixels; make them smaller"
                 raise Refused(message, 413)
         # Now as the library opens it, so that what passes here does no harm there.
         with av.open(str(path), options=CONTAINERS) as container:
-            stream = container.streams.video[0]
+            stream = video_stream(container)
             stream.thread_type, stream.codec_context.thread_count = "NONE", 1
             decoded = 0
             for count, packet in enumerate(container.demux(stream)):
@@ -191,7 +189,7 @@ def check(path: Path, limits: Limits) -> None:
                 raise Refused("no frame of it decodes; record it again")
     except MemoryError:
         raise Refused("takes too much memory to decode; send a shorter or smaller one", 413) from None
-    except (av.FFmpegError, ValueError, IndexError):
+    except (av.FFmpegError, ValueError):
         raise Refused(f"no video that can be read; send one of {', '.join(SUFFIXES)}") from None
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import av
 import cv2
@@ -25,9 +25,9 @@ cv2.setNumThreads(1)  # The files are what runs in parallel.
 av.logging.set_level(av.logging.PANIC)  # Broken files are reported in a line of our own.
 
 Image = npt.NDArray[np.uint8]
-SUFFIXES = (".avi", ".m4v", ".mjpg", ".mkv", ".mov", ".mp4", ".webm")
+SUFFIXES = (".avi", ".m4v", ".mjpeg", ".mjpg", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ts", ".webm", ".wmv")
 """Suffixes of video files, wherever they come from."""
-CONTAINERS = {"format_whitelist": "avi,matroska,mjpeg,mov"}
+CONTAINERS = {"format_whitelist": "asf,avi,matroska,mjpeg,mov,mpeg,mpegts"}
 """Containers that are accepted as videos, by FFmpeg's names. None can refer to other files, as a playlist does."""
 PLANAR = frozenset(f"yuv{j}{kind}p" for j in ("", "j") for kind in ("420", "422", "444", "440", "411", "410"))
 """Formats whose first plane is brightness and whose second and third are colour, 8 bits each."""
@@ -44,7 +44,7 @@ class Header:
     """What a file says of itself."""
 
     frames: int = 0
-    """Frames that the header promises; from the duration where it has no number; 0 where it has neither."""
+    """Frames that the header promises; from the duration where it has no number; 0 where it has neither, or guesses."""
     fps: float = 0.0
     """Frames a second; 0 where unknown."""
     hdr: bool = False
@@ -56,23 +56,26 @@ class Decoder:
 
     def __init__(self, path: Path) -> None:
         self._container: av.container.InputContainer | None = None
+        self._stream: av.VideoStream | None = None
         self.header = Header()
         try:
             # Without "file:" a name with a colon would be an address.
             self._container = av.open(f"file:{path}", options=CONTAINERS)
-            stream = self._container.streams.video[0]
-        except (av.FFmpegError, IndexError, ValueError):
+            self._stream = stream = video_stream(self._container)
+        except (av.FFmpegError, ValueError):
             return
         stream.thread_type = "NONE"
         stream.codec_context.thread_count = 1
         fps = float(stream.average_rate or 0)
         fps = fps if math.isfinite(fps) and fps > 0 else 0.0
         seconds = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else 0.0
-        promised = stream.frames
-        if promised and "mov" in self._container.format.name:
+        kind, promised = self._container.format.name, stream.frames
+        if promised and "mov" in kind:
             # An edit list may show fewer frames than are stored.
             promised = sum(not entry.is_discard for entry in stream.index_entries)
-        self.header = Header(promised or round(seconds * fps), fps, stream.codec_context.color_trc in HDR)
+        # MPEG's own streams have no header; FFmpeg guesses how long they last.
+        promised = promised or (0 if kind.startswith("mpeg") else round(seconds * fps))
+        self.header = Header(promised, fps, stream.codec_context.color_trc in HDR)
 
     def __enter__(self) -> Self:
         return self
@@ -82,10 +85,14 @@ class Decoder:
             self._container.close()
 
     def frames(self) -> Iterator[av.VideoFrame]:
-        """The frames that decode, in order; what is damaged is left out, as players do."""
-        if self._container is None or not self._container.streams.video:
+        """The frames that decode, in order, with square pixels.
+
+        What is damaged is left out: frames that the codec calls corrupt, and those coded as changes to them.
+        """
+        if self._container is None or self._stream is None:
             return
-        packets = self._container.demux(video=0)
+        packets, corrupt = self._container.demux(self._stream), False
+        aspect = float(self._stream.sample_aspect_ratio or 1)
         while True:
             try:
                 packet = next(packets, None)
@@ -95,13 +102,24 @@ class Decoder:
             if packet is None:
                 return
             for frame in decoded:
-                yield frame if frame.format.name in PLANAR else _reformat(frame, "yuv444p")
+                corrupt = frame.is_corrupt or (corrupt and not frame.key_frame)
+                # Narrower or lower, so that no header can make it larger.
+                size = max(1, round(frame.width * min(1, aspect))), max(1, round(frame.height / max(1, aspect)))
+                if not corrupt:
+                    yield frame if aspect == 1 and frame.format.name in PLANAR else _reformat(frame, "yuv444p", *size)
+
+
+def video_stream(container: av.container.InputContainer) -> av.VideoStream:
+    """The video of a file, of several the one that players show; ValueError where there is none."""
+    stream = container.streams.best("video")
+    if not isinstance(stream, av.VideoStream):
+        raise ValueError("no video in it")
+    return stream
 
 
 def picture(frame: av.VideoFrame) -> Image:
-    """A frame as uint8, height x width x BGR, turned as its metadata say."""
-    image = np.asarray(_reformat(frame, "bgr24").to_ndarray(), dtype=np.uint8)
-    return np.ascontiguousarray(np.rot90(image, turns(frame)))
+    """A frame as uint8, height x width x BGR, mirrored and turned as its metadata say."""
+    return upright(np.asarray(_reformat(frame, "bgr24").to_ndarray(), dtype=np.uint8), frame)
 
 
 def fit(frame: av.VideoFrame, config: FramesConfig) -> Image:
@@ -115,7 +133,7 @@ def fit(frame: av.VideoFrame, config: FramesConfig) -> Image:
     if config.fit == "crop":
         shown = tuple(_square(plane, *shown[0].shape) for plane in shown)
     shown = tuple(_resize(plane, config.pixels) for plane in shown)
-    return np.ascontiguousarray(np.rot90(to_rgb(cv2.merge(shown), frame), turns(frame)))
+    return upright(to_rgb(cv2.merge(shown), frame), frame)
 
 
 def _square(plane: Image, height: int, width: int) -> Image:
@@ -152,9 +170,21 @@ def to_rgb(yuv: Image, frame: av.VideoFrame) -> Image:
     return rgb
 
 
+def upright(image: Image, frame: av.VideoFrame) -> Image:
+    """A picture of a frame, mirrored left to right and then turned as the metadata ask for."""
+    return np.ascontiguousarray(np.rot90(image[:, ::-1] if _mirrors(frame) else image, turns(frame)))
+
+
 def turns(frame: av.VideoFrame) -> int:
-    """Counterclockwise quarter turns that the metadata ask for."""
-    return round(frame.rotation / 90) % 4
+    """Counterclockwise quarter turns that the metadata ask for, after mirroring."""
+    # FFmpeg tells where the right side goes, which a mirror makes the left one.
+    return round(frame.rotation / 90 + 2 * _mirrors(frame)) % 4
+
+
+def _mirrors(frame: av.VideoFrame) -> bool:
+    """Whether the display matrix (ISO 14496-12, 8.3.2) swaps left and right, whatever it turns."""
+    matrix: Any = frame.side_data.get("DISPLAYMATRIX")
+    return matrix is not None and bool(np.linalg.det(np.frombuffer(matrix, np.int32).reshape(3, 3)) < 0)
 
 
 def planes(frame: av.VideoFrame) -> tuple[Image, ...]:
@@ -175,6 +205,6 @@ def _colours(full: bool, bt709: bool) -> npt.NDArray[np.float64]:
     return np.column_stack([matrix, -matrix @ np.array([0 if full else 16, 128, 128])])
 
 
-def _reformat(frame: av.VideoFrame, pixels: str) -> av.VideoFrame:
+def _reformat(frame: av.VideoFrame, pixels: str, width: int | None = None, height: int | None = None) -> av.VideoFrame:
     """Convert in one thread: a forked process lacks the threads of its parent, but would wait for them for ever."""
-    return REFORMATTER.reformat(frame, format=pixels, threads=1)
+    return REFORMATTER.reformat(frame, width, height, format=pixels, threads=1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import struct
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -14,14 +15,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.config import FramesConfig
+from pipeline.use.media import Limits, check
 from pipeline.videos.decoding import Decoder, Header, fit, picture, planes, to_rgb, turns
 from pipeline.videos.film import KEY_EVERY, write_film
 from tests.conftest import encode, moving_square, refused, write_video
-from tests.frame_rules import decode, frames_of, pillow
+from tests.frame_rules import decode, frames_of, pillow, scanned
 
 ONE = 1 << 16
-TURNED = {90: (0, -ONE, ONE, 0), 180: (-ONE, 0, 0, -ONE), 270: (0, ONE, -ONE, 0)}
-"""Degrees against the clock, and the first four numbers of a QuickTime display matrix."""
+TURNED = {90: (0, -1, 1, 0), 180: (-1, 0, 0, -1), 270: (0, 1, -1, 0)}
+MIRRORED = {0: (-1, 0, 0, 1), 90: (0, 1, 1, 0), 180: (1, 0, 0, -1), 270: (0, -1, -1, 0)}
+"""Degrees against the clock, after mirroring or not, and a, b, c and d of a display matrix (ISO 14496-12, 8.3.2): it
+shows the pixel at (p, q) at (a p + c q, b p + d q), moved into the picture."""
 
 
 def opencv(path: Path) -> list[np.ndarray]:
@@ -114,26 +118,45 @@ def test_a_stream_that_names_bt709_is_taken_at_its_word() -> None:
     assert (fit(frame, FramesConfig(pixels=16)) != fit(other, FramesConfig(pixels=16))).any()
 
 
-@pytest.mark.parametrize("degrees", TURNED)
+@pytest.mark.parametrize(("degrees", "matrix"), [*TURNED.items(), *MIRRORED.items()])
 @pytest.mark.parametrize(("codec", "pixels", "mode"), [("mpeg4", "yuv420p", "crop"), ("png", "rgb24", "squash")])
-def test_turned_videos_are_upright(tmp_path: Path, degrees: int, codec: str, pixels: str, mode: str) -> None:
+def test_turned_and_mirrored_videos_are_upright(
+    tmp_path: Path, degrees: int, matrix: tuple[int, int, int, int], codec: str, pixels: str, mode: str
+) -> None:
     path = encode(tmp_path / "v.mov", [gradient(36, 48)] * 2, codec, pixels)
-    config = FramesConfig(pixels=32, fit=mode)
-    upright = fit(frames_of(path)[0], config)
-    data = bytearray(path.read_bytes())
-    matrix = data.index(b"tkhd") + 4 + 40
-    a, b, c, d = TURNED[degrees]
-    assert struct.unpack_from(">9i", data, matrix)[:5] == (ONE, 0, 0, 0, ONE)
-    struct.pack_into(">9i", data, matrix, a, b, 0, c, d, 0, 0, 0, 1 << 30)
+    stored, config = frames_of(path)[0], FramesConfig(pixels=32, fit=mode)
+    data, (a, b, c, d) = bytearray(path.read_bytes()), matrix
+    place = data.index(b"tkhd") + 4 + 40
+    assert struct.unpack_from(">9i", data, place)[:5] == (ONE, 0, 0, 0, ONE)
+    struct.pack_into(">9i", data, place, a * ONE, b * ONE, 0, c * ONE, d * ONE, 0, 0, 0, 1 << 30)
     path.write_bytes(data)
     frame = frames_of(path)[0]
     assert 90 * turns(frame) == degrees
-    expected = opencv(path)[0].astype(int)
-    assert picture(frame).shape == expected.shape == ((48, 36, 3) if degrees % 180 else (36, 48, 3))
-    assert np.abs(picture(frame) - expected).max() <= 2, "OpenCV turns pictures by itself"
-    turned = fit(frame, config)
-    np.testing.assert_array_equal(turned, np.rot90(upright, degrees // 90))
-    assert turned.flags.c_contiguous
+    for before, shown in ((picture(stored), picture(frame)), (fit(stored, config), fit(frame, config))):
+        q, p = np.mgrid[: before.shape[0], : before.shape[1]]
+        x, y = a * p + c * q, b * p + d * q
+        np.testing.assert_array_equal(shown[y - y.min(), x - x.min()], before)
+        assert shown.size == before.size
+        assert shown.flags.c_contiguous
+
+
+@pytest.mark.parametrize(("aspect", "size"), [(Fraction(4, 3), (48, 27)), (Fraction(1, 2), (24, 36))])
+def test_pixels_that_are_no_squares_are_made_squares(tmp_path: Path, aspect: Fraction, size: tuple[int, int]) -> None:
+    path = encode(tmp_path / "v.mp4", [gradient(36, 48)] * 2, "mpeg4", "yuv420p", aspect=aspect)
+    expected = cv2.resize(opencv(path)[0], size, interpolation=cv2.INTER_AREA).astype(int)
+    assert np.abs(next(decode(path)) - expected).mean() < 4
+
+
+@pytest.mark.parametrize("default", [0, 1])
+def test_of_two_tracks_the_default_is_read(tmp_path: Path, default: int) -> None:
+    with av.open(str(path := tmp_path / "v.mkv"), "w") as container:
+        streams = [container.add_stream("mpeg4", rate=25, width=48, height=height) for height in (32, 64)]
+        streams[default].disposition, streams[1 - default].disposition = map(av.stream.Disposition, (1, 0))
+        for stream in streams:
+            frame = av.VideoFrame.from_ndarray(gradient(stream.height, 48), format="bgr24")
+            container.mux([*stream.encode(frame), *stream.encode(None)])
+    assert [shown.shape for shown in decode(path)] == [((32, 64)[default], 48, 3)]
+    check(path, Limits())  # A server takes it.
 
 
 @pytest.mark.parametrize("content", [b"", b"no video at all " * 40, b"RIFF\0\0\0\0AVI LIST", bytes(5000), None])
@@ -195,6 +218,20 @@ def test_damage_in_the_middle_costs_no_more_than_what_it_hits(tmp_path: Path) ->
     data[middle : middle + 3000] = np.random.default_rng(0).bytes(3000)
     path.write_bytes(data)
     assert max(21, len(opencv(path))) <= len(list(decode(path))) < 41
+
+
+def test_frames_that_damage_changed_are_left_out(tmp_path: Path) -> None:
+    """Up to the next whole picture, one in twelve: those between are coded as changes to the damaged one."""
+    path = encode(tmp_path / "v.mp4", moving_square(40), "mpeg4", "yuv420p")
+    whole, data = list(decode(path)), bytearray(path.read_bytes())
+    with av.open(str(path)) as container:
+        packet = [*container.demux(video=0)][15]
+    place = data.index(bytes(packet)) + packet.size // 3
+    data[place : place + 16] = np.random.default_rng(0).bytes(16)
+    path.write_bytes(data)
+    assert len(opencv(path)) == 40, "the other decoder takes them"
+    np.testing.assert_array_equal(list(decode(path)), whole[:15] + whole[24:])
+    assert scanned(path).probe.header_frames == 40, "which the audit compares"
 
 
 @pytest.mark.parametrize("suffix", ["mov", "avi", "mkv"])
