@@ -27,7 +27,7 @@ from pipeline.videos.files import list_videos
 from pipeline.videos.film import write_film
 from pipeline.videos.frames.reference import LONGEST
 from pipeline.videos.importing.bags import shots
-from pipeline.videos.importing.presses import SHORTEST, FrameTime, cut, presses
+from pipeline.videos.importing.presses import SHORTEST, FrameTime, cut, film, presses
 from tests.frame_rules import decode, scanned
 from tests.use.videos import recording
 
@@ -52,10 +52,11 @@ def message(store: Any, picture: np.ndarray, encoding: str, index: int, at: int)
     stamp = types["builtin_interfaces/msg/Time"](sec=at // 10**9, nanosec=at % 10**9)
     extra = {"seq": index} if "seq" in types["std_msgs/msg/Header"].__dataclass_fields__ else {}
     header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="gel", **extra)
-    if encoding in ("png", "broken"):
-        data = cv2.imencode(".png", picture)[1].ravel() if encoding == "png" else np.arange(40, dtype=np.uint8)
+    if "png" in encoding or encoding == "broken":
+        sent = picture[:, :, ::-1] if "compressed rgb" in encoding else picture
+        data = np.arange(40, dtype=np.uint8) if encoding == "broken" else cv2.imencode(".png", sent)[1].ravel()
         kind = "sensor_msgs/msg/CompressedImage"
-        return types[kind](header=header, format="bgr8; png compressed bgr8", data=data), kind
+        return types[kind](header=header, format=encoding, data=data), kind
     height, width = picture.shape[:2]
     order = picture[:, :, ::-1] if encoding.startswith("rgb") else picture
     if encoding in ("mono8", "8UC1"):
@@ -102,6 +103,7 @@ def pictures() -> list[np.ndarray]:
     ("kind", "encoding"),
     [
         *(("ros1", encoding) for encoding in ("8UC3", "rgb8", "bgra8", "rgba8", "mono8", "8UC1", "png")),
+        *(("ros1", f"rgb8; png compressed {order}") for order in ("rgb8", "bgr8")),
         *(("sqlite3", "bgr8"), ("sqlite3", "png"), ("mcap", "bgr8")),
     ],
 )
@@ -193,8 +195,10 @@ def imported(*command: object) -> str:
 
 
 def test_what_is_no_recording_of_touch_is_refused_in_one_line(tmp_path: Path, pictures: list[np.ndarray]) -> None:
-    def bag(*sent: np.ndarray, encoding: str = "bgr8", kind: str = "ros1") -> Path:
-        return write_bag(Path(mkdtemp(dir=tmp_path)), kind, sent, encoding)
+    def bag(*sent: np.ndarray, encoding: str = "bgr8", kind: str = "ros1", late: int = 0) -> Path:
+        """With the recorder's clock set back by so many seconds in the middle of thirty pictures."""
+        times = (lambda i: EVEN(i) - (i >= 15) * late * 10**9), EVEN
+        return write_bag(Path(mkdtemp(dir=tmp_path)), kind, sent, encoding, *times)
 
     def cut_off(kind: str, share: float) -> Path:
         whole = bag(*pictures[:30], kind=kind)
@@ -212,7 +216,9 @@ def test_what_is_no_recording_of_touch_is_refused_in_one_line(tmp_path: Path, pi
         (bag(pictures[0]), "1 pictures are no press"),
         (bag(*pictures[:2], encoding="16UC1"), "encoding '16UC1'; send one of bgr8, 8UC3, rgb8, mono8, 8UC1"),
         (bag(*pictures[:2], encoding="broken"), "is no picture that OpenCV reads"),
+        (bag(pictures[0].astype(np.uint16) * 16, encoding="png"), "save it in 8 bits"),
         (bag(pictures[0], pictures[1][:-2]), "change their size"),
+        *((bag(*pictures[:30], late=seconds), "its clock was set back") for seconds in (1, 3600)),
         *((source, "not a whole recording") for source in (text, empty)),
         *((cut_off(kind, share), "copy it again") for kind, share in itertools.product(kinds, shares)),
         (bag(*pictures), "--object", "--object", "../rug"),
@@ -258,11 +264,41 @@ def test_a_long_video_and_a_folder_of_pictures_are_cut_as_a_bag_is(tmp_path: Pat
         (folder, ["--fps", "25"], "frame_3.png: of another size"),
         (folder, [], "say --fps"),
         (folder, ["--fps", "0.5"], "--fps takes 1 to 240"),
-        (empty, ["--fps", "25"], "no picture (.jpeg, .jpg, .png) in it"),
+        (empty, ["--fps", "25"], "no picture decodes"),
         (tmp_path / "none.mp4", [], "no such file"),
-        (text, ["--fps", "25"], "no frame decodes"),
+        (text, ["--fps", "25"], "no picture decodes"),
     ):
         assert re.match(f"refused: .*{re.escape(words)}", imported(*command, source, *options))
+
+
+@pytest.mark.parametrize(
+    "names", [["grasp1.9", "grasp1.10"], ["1700000000.12", "1700000000.2"], [str(n / 25) for n in range(1, 60)]]
+)
+def test_pictures_are_ordered_as_their_names_count(tmp_path: Path, names: list[str]) -> None:
+    for value, name in enumerate(names):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((4, 4, 3), value, np.uint8))
+    assert [int(shot.picture[0, 0, 0]) for shot in film(tmp_path, 25.0)] == [*range(len(names))]
+
+
+def test_a_picture_that_was_cut_off_is_left_out_and_counted(
+    tmp_path: Path, pictures: list[np.ndarray], caplog: pytest.LogCaptureFixture
+) -> None:
+    for number, shown in enumerate(pictures[:6]):
+        cv2.imwrite(str(file := tmp_path / f"{number}.jpg"), shown)
+        if number in (2, 5):
+            file.write_bytes(file.read_bytes()[: -1 if number == 2 else 900])
+    assert [shot.recorded // STEP_NS for shot in film(tmp_path, 25.0)] == [0, 1, 3, 4], "at the others' own times"
+    assert f"{tmp_path}: 2 of 6 pictures are cut off" in caplog.text
+
+
+def test_few_bits_in_many_are_no_black_picture(tmp_path: Path, pictures: list[np.ndarray]) -> None:
+    """Where all sixteen are used the upper eight count."""
+    for number, times in enumerate((257, 16)):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), pictures[0].astype(np.uint16) * times)
+    shown = film(tmp_path, 25.0)
+    np.testing.assert_array_equal(next(shown).picture, pictures[0])
+    with pytest.raises(UserError, match=r"1\.png: .* save it in 8 bits"):
+        next(shown)
 
 
 def test_a_video_of_varying_rate_is_cut_by_its_time_stamps(tmp_path: Path) -> None:

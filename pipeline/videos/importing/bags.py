@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,8 @@ import numpy as np
 
 from pipeline.core.errors import UserError
 from pipeline.videos.decoding import Image
-from pipeline.videos.importing.presses import Shot
+from pipeline.videos.frames.reference import LONGEST
+from pipeline.videos.importing.presses import Shot, read_picture
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 ENCODINGS: dict[str, tuple[int, int | None]] = {
@@ -38,7 +39,7 @@ def shots(bag: Path, topic: str) -> Iterator[Shot]:
         raise UserError("reading bags takes the package rosbags: pip install -e '.[robot]'") from None
     if not bag.exists():
         raise UserError(f"{bag}: no such recording; name a .bag, a ROS 2 folder, or an .mcap or .db3 file")
-    size = None
+    size, times = None, list[tuple[int, int]]()
     try:
         # Bags of ROS 2 before Iron do not say what their messages look like; images have not changed since.
         with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
@@ -53,8 +54,8 @@ def shots(bag: Path, topic: str) -> Iterator[Shot]:
                 size = size or image.shape
                 if image.shape != size:
                     raise UserError(f"{bag}: pictures of {topic} change their size; record them anew in one size")
-                stamp = message.header.stamp
-                yield Shot(image, received, stamp.sec * 10**9 + stamp.nanosec)
+                times.append((received, message.header.stamp.sec * 10**9 + message.header.stamp.nanosec))
+                yield Shot(image, *times[-1])
     except UserError:
         raise
     except Exception as problem:  # A damaged bag fails in the reader, its storage, its index or its messages.
@@ -65,16 +66,29 @@ def shots(bag: Path, topic: str) -> Iterator[Shot]:
         ) from None
     if size is None:
         raise UserError(f"{bag}: no picture of {topic} in it; record it again")
+    if len(times) > 1 and _mixed(times):
+        raise UserError(f"{bag}: its clock was set back, so pictures of {topic} are mixed up; record it again")
+
+
+def _mixed(times: Sequence[tuple[int, int]]) -> bool:
+    """Whether the clock that a bag is sorted by was set back, by arrivals and stamps in ns.
+
+    Stamps then fall often, or once across a gap; if the camera's own clock was set, once between even arrivals.
+    """
+    waits, steps = np.diff(np.array(times), axis=0).T
+    fell = steps < -2 * np.median(np.diff(np.sort([stamp for _, stamp in times])))
+    return bool(fell.sum() > 1 or (waits[fell] > LONGEST * waits.mean()).any())
 
 
 def _picture(message: Any, where: str) -> Image:
     """A message as height x width x BGR."""
     data = np.asarray(message.data, dtype=np.uint8)
     if not hasattr(message, "encoding"):
-        decoded = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+        decoded = read_picture(data, where)
         if decoded is None:
             raise UserError(f"{where} is no picture that OpenCV reads (format {message.format!r}); send jpeg or png")
-        return np.asarray(decoded, dtype=np.uint8)
+        # That encoder was handed red first and takes blue first.
+        return np.ascontiguousarray(decoded[:, :, ::-1]) if "compressed rgb" in message.format else decoded
     height, width, step = message.height, message.width, message.step
     size, way = ENCODINGS.get(message.encoding, (0, None))
     if not size:

@@ -6,14 +6,15 @@ A press is where the picture differs from the untouched one by much more than th
 from __future__ import annotations
 
 import itertools
+import logging
 import math
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from decimal import Decimal
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import av
 import cv2
@@ -39,7 +40,11 @@ from pipeline.videos.frames.reference import (
     unsteady_frames,
 )
 
+log = logging.getLogger(__name__)
+
 PICTURES = (".jpeg", ".jpg", ".png")
+TIMES = re.compile(r"\d{9}\.\d|\d\.0\d")
+"""Seconds since 1970, or a fraction that begins with 0: pictures are named by time, and not by number."""
 RELEASED = 0.75
 """A press ends under this share of the strength that it begins at, so that noise at the threshold cuts none in two."""
 QUIET = 0.1
@@ -177,47 +182,60 @@ def film(path: Path, fps: float = 0.0, begin: float = 0.0, end: float | None = N
     """The pictures of a video, or of a folder of PNG or JPEG files by their names (2 before 10).
 
     From `begin` to `end`, in seconds, at `fps` pictures a second; with 0 a video's pictures are at their own time
-    stamps, since telephones record at a rate that varies, and a folder has none.
-    UserError where there is no picture, one cannot be read or has another size, or the rate is unknown.
+    stamps, since telephones record at a rate that varies, and a folder has none. What is cut off or damaged is left
+    out, and counted in a warning.
+    UserError where no picture decodes, one has another size or too few bits, or the rate is unknown.
     """
     if not path.exists():
         raise UserError(f"{path}: no such file; name a video or a folder of pictures")
-    rate = fps
-    if path.is_dir():
-        files = [file for file in path.iterdir() if file.suffix.lower() in PICTURES]
-        files.sort(key=lambda file: [int(word) if word.isdecimal() else word for word in re.split(r"(\d+)", file.name)])
-        pictures: Iterator[tuple[str, Any, float | None]] = ((str(f), cv2.imread(str(f)), None) for f in files)
-    else:
-        with Decoder(path) as decoder:
-            rate = rate or decoder.header.fps
-        pictures = _stamped(path)
-    if rate <= 0:
-        raise UserError(f"{path}: its frames a second are not known; say --fps, or name a video")
-    if not RATES[0] <= rate <= RATES[1]:  # NaN fails this, too.
-        raise UserError(f"{path}: {rate:g} frames a second; --fps takes {RATES[0]:g} to {RATES[1]:g}")
-    size = first = None
-    for number, (where, picture, stamp) in enumerate(pictures):
-        if picture is None:
-            raise UserError(f"{where}: no picture that OpenCV reads; copy it again, or remove it")
-        size = size or picture.shape
-        if picture.shape != size:
-            raise UserError(f"{where}: of another size than the first picture; record them in one size")
-        first = stamp if number == 0 else first
-        at = round(1e9 * (number / rate if fps or stamp is None or first is None else stamp - first))
-        if end is not None and at >= end * 1e9:
-            return
-        if at >= begin * 1e9:
-            yield Shot(np.asarray(picture, dtype=np.uint8), at, at)
-    if size is None:
-        what = f"no picture ({', '.join(PICTURES)}) in it" if path.is_dir() else "no frame decodes"
-        raise UserError(f"{path}: {what}; name a video or a folder of pictures")
-
-
-def _stamped(path: Path) -> Iterator[tuple[str, Image, float | None]]:
-    """The pictures of a video, each with its name and its time stamp in seconds."""
+    pictures: Iterator[tuple[str, Image | None, float | None]]
     with Decoder(path) as decoder:
-        for number, frame in enumerate(decoder.frames()):
-            yield f"{path}, frame {number}", decoding.picture(frame), frame.time
+        rate = fps or decoder.header.fps
+        if path.is_dir():
+            files = [file for file in path.iterdir() if file.suffix.lower() in PICTURES]
+            number = re.compile(r"(\d+(?:\.\d+)?)" if any(TIMES.search(file.stem) for file in files) else r"(\d+)")
+            files.sort(key=lambda file: [Decimal(w) if i % 2 else w for i, w in enumerate(number.split(file.name))])
+            pictures = ((str(f), read_picture(np.fromfile(f, np.uint8), str(f)), None) for f in files)
+            promised = len(files)
+        else:
+            pictures = ((str(path), decoding.picture(frame), frame.time) for frame in decoder.frames())
+            promised = decoder.header.frames
+        if rate <= 0:
+            raise UserError(f"{path}: its frames a second are not known; say --fps, or name a video")
+        if not RATES[0] <= rate <= RATES[1]:  # NaN fails this, too.
+            raise UserError(f"{path}: {rate:g} frames a second; --fps takes {RATES[0]:g} to {RATES[1]:g}")
+        size, first, decoded = None, None, 0
+        for place, (where, picture, stamp) in enumerate(pictures):
+            if picture is None:
+                continue
+            decoded += 1
+            size = size or picture.shape
+            if picture.shape != size:
+                raise UserError(f"{where}: of another size than the first picture; record them in one size")
+            first = stamp if place == 0 else first
+            at = round(1e9 * (place / rate if fps or stamp is None or first is None else stamp - first))
+            if end is not None and at >= end * 1e9:
+                return
+            if at >= begin * 1e9:
+                yield Shot(picture, at, at)
+    if size is None:
+        raise UserError(f"{path}: no picture decodes; name a video, or a folder of {', '.join(PICTURES)}")
+    if decoded < promised:
+        log.warning("%s: %d of %d pictures are cut off or damaged and left out", path, promised - decoded, promised)
+
+
+def read_picture(data: npt.NDArray[np.uint8], where: str) -> Image | None:
+    """A PNG or JPEG file as uint8, height x width x BGR: of 16 bits a value the upper eight.
+
+    None where it does not decode to its end; UserError where the upper bits are empty.
+    """
+    # `imread` would fill what a file that was cut off lacks with grey.
+    picture = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH) if len(data) else None
+    if picture is not None and picture.dtype == np.uint16:
+        if picture.max() < 1 << 14:  # Cameras of 10 or 12 bits often fill the lower ones.
+            raise UserError(f"{where}: has no value over {picture.max()} of 65535; save it in 8 bits, bright enough")
+        picture >>= 8
+    return None if picture is None else picture.astype(np.uint8)
 
 
 def presses(strengths: npt.NDArray[np.float64], times: float = FOUND) -> list[tuple[int, int]]:
