@@ -38,7 +38,7 @@ def watch(camera: str) -> Iterator[Shot]:
     """
     if Path(camera).is_dir():
         raise UserError(f"{camera}: is a folder; name a camera or a video, or use `octopi import video`")
-    if Path(camera).exists() and not camera.isdecimal():
+    if Path(camera).is_file() and not camera.isdecimal():  # A device may be named by its path, too.
         yield from film(Path(camera))
         return
     capture = cv2.VideoCapture(int(camera) if camera.isdecimal() else camera)

@@ -95,6 +95,9 @@ def test_by_command_on_a_file_and_on_a_camera_that_drops_frames(
     assert all("25.0 a second: hardness " in line for line in lines)
     monkeypatch.setattr(cv2, "VideoCapture", lambda name: Camera(pictures, name))
     monkeypatch.setattr(live, "PAUSE", 0.0)
+    (device := tmp_path / "usb-camera").symlink_to("/dev/null")
+    with pytest.raises(UserError, match="usb-camera: no camera that opens"):
+        next(live.watch(str(device)))
     said = CliRunner().invoke(app, [*command, "0", "--ask", "How soft is it?", *model])
     assert sum(line.startswith("press") for line in said.stdout.splitlines()) == 2
     assert isinstance(said.exception, UserError)
