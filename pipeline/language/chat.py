@@ -7,6 +7,7 @@ The chat format is the tokenizer's own template where it has one, else Vicuna v1
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import date
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -27,6 +28,11 @@ VICUNA = (
 """Vicuna v1.5's format (FastChat's `vicuna_v1.1`): `SYSTEM USER: question ASSISTANT: answer</s>USER: ...`."""
 PROBE = "Octopi"
 """A placeholder, rendered to find out what a chat template writes around an answer."""
+DAY = date(2024, 7, 26)
+"""What templates that ask for today are told (Llama 3.2's), so that a prompt is the same on every day."""
+TOLD = "".join(f" | replace('%{letter}', '{DAY:%{letter}}')" for letter in "aAbBcdfHIjmMpSUwWxXyYzZ")
+TODAY = "{% macro strftime_now(form) %}{{ form" + TOLD + " }}{% endmacro %}\n"
+"""Put before a template, in place of transformers' own function; the line end is swallowed."""
 IGNORE_INDEX = -100
 """Label of a token that the loss leaves out (torch's and transformers' convention)."""
 
@@ -139,9 +145,10 @@ def conclusions(rendered: Rendered, turns: Sequence[Turn]) -> Rendered:
 
 def _templated(messages: Sequence[dict[str, str]], tokenizer: PreTrainedTokenizerBase, *, ask: bool) -> str:
     """Render messages by the tokenizer's template, or Vicuna's; `ask` appends what it writes before an answer."""
-    asked = {"chat_template": None if tokenizer.chat_template else VICUNA, "add_generation_prompt": ask}
     try:
-        return str(tokenizer.apply_chat_template(list(messages), tokenize=False, **asked))
+        template = TODAY + (tokenizer.get_chat_template() if tokenizer.chat_template else VICUNA)
+        how = {"chat_template": template, "tokenize": False, "add_generation_prompt": ask}
+        return str(tokenizer.apply_chat_template(list(messages), **how))
     except (TemplateError, ValueError) as error:
         raise UserError(
             f"language.weights: the chat template in {tokenizer.name_or_path} fails ({' '.join(str(error).split())}); "

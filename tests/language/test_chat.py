@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import io
 from contextlib import suppress
+from datetime import date
 from itertools import pairwise, takewhile
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import torch
@@ -186,6 +188,16 @@ def test_what_a_template_writes_before_an_answer_is_asked_and_not_learnt(
     assert whole.text == text
     assert sum(label != IGNORE_INDEX and a == IGNORE_INDEX for a, label in pairwise(trained.labels)) == len(turns)
     assert end_ids(knows_all) == (2, end)
+
+
+def test_no_day_is_in_a_conversation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Llama 3.2's template asks for today's: the text is what transformers itself wrote on the day of ours."""
+    tokenizer, said = sentence_piece(), [{"role": "user", "content": "a"}, {"role": "assistant", "content": "b"}]
+    tokenizer.chat_template = "\n  {% if strftime_now is defined %}{{ strftime_now('%d %b %Y') }}{% endif %}" + VICUNA
+    for day in (date(2024, 7, 26), date(2026, 1, 1)):
+        monkeypatch.setattr("transformers.utils.chat_template_utils.datetime", mock.Mock(now=lambda day=day: day))
+        ours = render([Turn(user="a", assistant="b")], tokenizer, system_prompt="", frames=1, complete=True).text
+        assert (ours == tokenizer.apply_chat_template(said, tokenize=False)) == (day.year == 2024)
 
 
 REFUSED = {
