@@ -56,9 +56,10 @@ def write_clip(folder: Path, seed: int = 0, config: dict[str, dict[str, Any]] = 
 def write_llama(
     folder: Path, seed: int = 0, *, bos: bool = True, pad: str | None = "<pad>", shard: str = "5GB", **shapes: object
 ) -> Path:
-    """A Llama with a byte-level tokenizer as `save_pretrained` lays it out; `shapes` go to its LlamaConfig."""
+    """A Llama (or a `kind`) with a byte-level tokenizer as `save_pretrained` lays it out; `shapes` go to its config."""
+    import transformers
     from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors
-    from transformers import LlamaConfig, LlamaForCausalLM, PreTrainedTokenizerFast
+    from transformers import PreTrainedTokenizerFast
 
     special = ["<pad>", "<s>", "</s>", "<unk>"]
     alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
@@ -74,7 +75,9 @@ def write_llama(
     usual = {"vocab_size": len(vocabulary), "hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2}
     usual |= {"num_attention_heads": 4, "num_key_value_heads": 2, "max_position_embeddings": 2048}
     usual |= {"bos_token_id": 1, "eos_token_id": 2, "pad_token_id": 0}
-    LlamaForCausalLM(LlamaConfig(**(usual | shapes))).save_pretrained(folder, max_shard_size=shard)  # type: ignore[arg-type]
+    kind = shapes.pop("kind", "Llama")
+    config = getattr(transformers, f"{kind}Config")(**(usual | shapes))
+    getattr(transformers, f"{kind}ForCausalLM")(config).save_pretrained(folder, max_shard_size=shard)
     return folder
 
 

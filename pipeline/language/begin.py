@@ -24,11 +24,12 @@ def begin_with_words(model: OctopiForCausalLM, data: ConversationDataset, catalo
     What is fitted are the unmirrored frames and the labels of `data`. Noise is added to the frames, or the projection
     would memorise the few objects.
     """
-    tokenizer, matrix = model.tokenizer, model.llm.get_input_embeddings().weight.detach().float()
-    classes = [
-        [matrix[tokenizer.encode(f" {level}", add_special_tokens=False)].mean(0) for level in prop.levels]
-        for prop in catalogue.properties
-    ]
+
+    def word(level: str) -> torch.Tensor:
+        ids = model.tokenizer.encode(f" {level}", add_special_tokens=False)
+        return model.embed_words(torch.tensor(ids, device=model.llm.device)).detach().float().mean(0)
+
+    classes = [[word(level) for level in prop.levels] for prop in catalogue.properties]
     labels = {v: label for q in data.questions for v, label in zip(q.videos, q.gold.labels, strict=True)}
     frames, wanted = [], []
     for video, label in sorted(labels.items()):

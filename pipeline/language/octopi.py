@@ -89,18 +89,20 @@ class OctopiForCausalLM(nn.Module):
     ) -> None:
         super().__init__()
         self.llm = llm
-        matrix = llm.get_input_embeddings().weight
+        words = llm.get_input_embeddings()
+        # As the layer gives them: Gemma's scales its rows by the root of their length.
+        matrix = words(torch.arange(words.num_embeddings, device=words.weight.device)).detach().float()
         self.connector = Connector(tactile_dim, matrix.shape[1])
         # Not named `config`: Trainer takes an attribute of that name for transformers' own and writes into it.
         self.octopi_config = OctopiConfig(
             base_model=base, tactile_dim=tactile_dim, hidden_size=matrix.shape[1], normalized=normalize
         )
-        self.word_rms = float(matrix.detach().float().square().mean().sqrt()) if normalize else None
+        self.word_rms = float(matrix.square().mean().sqrt()) if normalize else None
         self.words: nn.Embedding | None = None
         """The word embeddings where they are trained (`train_words`), in place of the language model's."""
         with torch.no_grad():
             # The mean of all words is a neutral start for a new one.
-            self.connector.delimiters.copy_(matrix.float().mean(0).expand(2, -1))
+            self.connector.delimiters.copy_(matrix.mean(0).expand(2, -1))
         ids = tokenizer.convert_tokens_to_ids(list(TACTILE_TOKENS))
         self.start_id, self.frame_id, self.end_id = ids
         self.tokenizer = tokenizer

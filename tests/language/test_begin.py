@@ -13,6 +13,7 @@ from torch.nn import functional as F
 from pipeline.core.records import Question
 from pipeline.language.begin import begin_with_words
 from pipeline.language.training import Material, assemble
+from tests.checkpoints import write_llama
 from tests.language.conftest import CATALOGUE, DIM, taking, write_store
 
 
@@ -23,21 +24,23 @@ def felt(labels: tuple[int, ...], drawn: torch.Generator) -> torch.Tensor:
     return clean + 0.05 * torch.randn(DIM, generator=drawn)
 
 
-@pytest.mark.parametrize("normalize", [False, True])
+@pytest.mark.parametrize("kind", ["Llama", "Llama, normalized", "Gemma"])
 def test_frames_read_like_the_words_of_their_classes(
-    normalize: bool, held: Material, questions: list[Question], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kind: str, held: Material, questions: list[Question], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    kind, _, normalize = kind.partition(", ")
+    base = str(write_llama(tmp_path / "base", kind=kind))
     labels = {v: label for q in questions for v, label in zip(q.videos, q.gold.labels, strict=True)}
     drawn = torch.Generator().manual_seed(0)
     frames = [(v, f, "none") for v in sorted(labels) for f in range(3)]
     store = write_store(tmp_path, frames, torch.stack([felt(labels[v], drawn) for v, _, _ in frames]))
-    language = held.language.model_copy(update={"normalize_touch": normalize})
-    monkeypatch.setattr("pipeline.language.begin.STEPS", 150)
+    language = held.language.model_copy(update={"normalize_touch": bool(normalize), "weights": base})
+    monkeypatch.setattr("pipeline.language.begin.STEPS", 250)
     model, data = assemble(replace(held, language=language, store=store), taking(14), "test")
     begin_with_words(model, data, CATALOGUE, seed=1)
     assert all(p.grad is None for p in model.parameters())
 
-    words = model.llm.get_input_embeddings().weight
+    words = model.llm.get_input_embeddings()(torch.arange(260))
     seen = sorted({label for q in data.questions for label in q.gold.labels})
     assert len(seen) > 4
     means = torch.zeros(len(seen), words.shape[1])

@@ -29,10 +29,12 @@ CONNECTOR, WORDS = "connector.safetensors", "words.safetensors"
 ADAPTER = "adapter/adapter_model.safetensors"
 
 
-def test_normalized_touch_is_as_long_as_words(language: LanguageConfig, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["Llama", "Gemma"])
+def test_normalized_touch_is_as_long_as_words(kind: str, tmp_path: Path) -> None:
     """However long the projection makes it, and so too in a model that is read back."""
-    model = OctopiForCausalLM.from_base(language.weights, DIM, normalize=True)
-    words = model.llm.get_input_embeddings().weight
+    model = OctopiForCausalLM.from_base(write_llama(tmp_path / "base", kind=kind), DIM, normalize=True)
+    words = model.llm.get_input_embeddings()(torch.arange(260))
+    torch.testing.assert_close(model.connector.delimiters, words.mean(0).expand(2, -1))
     ids = call(model)["input_ids"]
     frames = ids[0] == model.frame_id
     for size in (1e-3, 1.0, 1e4):
