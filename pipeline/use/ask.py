@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.markup import escape
-from rich.table import Table
+from rich.table import Column, Table
 
 from pipeline.core.errors import UserError, readable
 from pipeline.core.io import sha256, write_text
@@ -205,7 +205,8 @@ def described(model: Octopi, paths: Sequence[Path]) -> tuple[Table, list[str]]:
         UserError: the first video's error, where none could be described.
     """
     files = videos_of(paths)
-    table = Table("video", *model.properties, "in words")
+    # Folded, since names that are cut may be those of several files.
+    table = Table(*(Column(name, overflow="fold") for name in ("video", *model.properties, "in words")))
     notes, errors = [*model.doubts], list[str]()
     for row in _describe(model, files):
         found = [(row.get(p), row.get(f"{p}: {row.get(p)}")) for p in model.properties]

@@ -55,7 +55,7 @@ class ChatRequest(BaseModel):
 
     model: str = Field(max_length=200)
     messages: Annotated[list[Message], Field(min_length=1, max_length=MESSAGES)]
-    stream: bool = False
+    stream: bool | None = None
     max_tokens: int | None = Field(default=None, ge=1)
     max_completion_tokens: int | None = Field(default=None, ge=1)
     n: Literal[1] | None = None

@@ -171,7 +171,7 @@ def test_described_by_command(by_command: Command, folder: Path, files: list[Pat
 
 
 def test_described_compared_ranked_and_matched_by_command(
-    by_command: Command, octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPatch
+    by_command: Command, octopi: Octopi, files: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each as the call of the same name, and what makes one doubt it on stderr, once."""
     monkeypatch.setattr(octopi, "doubts", ("no answer means anything",))
@@ -183,6 +183,10 @@ def test_described_compared_ranked_and_matched_by_command(
 
     one, two, three = map(str, files)
     known, table = octopi.describe(one), said("describe", one)
+    long = shutil.copy(one, tmp_path / f"{'long_' * 20}name.avi")
+    assert (
+        "".join(line[1:].split("│")[0].strip() for line in said("describe", long).splitlines()[3:-1]) == Path(long).name
+    )
     shares = (f"({max(found.values()):.0%})" for found in known.probabilities.values())
     assert all(word in table for word in (files[0].name, *known.levels, *known.levels.values(), *shares))
     assert said("compare", one, two, "hardness") == octopi.compare(one, two, "hardness").answer + "\n"

@@ -70,6 +70,7 @@ def test_an_answer_has_openai_s_form(client: TestClient) -> None:
 
 def test_a_stream_has_openai_s_chunks(client: TestClient) -> None:
     response = client.post(CHAT, json=body(user(text("one two"), part(video(1))), stream=True))
+    assert client.post(CHAT, json=body(user("one"), stream=None)).json()["object"] == "chat.completion"
     assert response.headers["content-type"].startswith("text/event-stream")
     *events_, done = events(response.text)
     assert done == "[DONE]"
