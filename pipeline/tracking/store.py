@@ -78,6 +78,7 @@ class Store:
         )
         import mlflow.store.db.utils
         from filelock import FileLock
+        from mlflow.utils.rest_utils import http_request
 
         for name in ("alembic", "mlflow"):
             logging.getLogger(name).setLevel(logging.ERROR)
@@ -98,8 +99,16 @@ class Store:
         # Several first starts at once on a new database break it.
         with self.lock:
             self.client = mlflow.MlflowClient(self.uri, self.uri)
+            if tracking.uri.startswith("http"):
+                # An older server does not know models as this client logs them, and answers each with an HTML page.
+                said = http_request(self.client._tracking_client.store.get_host_creds(), "/version", "GET")
+                if said.ok and said.text[:2] in ("0.", "1.", "2."):
+                    raise TrackingError(f"tracking.uri: {tracking.uri} is MLflow {said.text}; name one of 3 or newer")
             if found := self.client.get_experiment_by_name(tracking.experiment):
                 self.experiment = str(found.experiment_id)
+                if found.lifecycle_stage != "active":
+                    mend = f"name another, or restore it: mlflow experiments restore -x {self.experiment}"
+                    raise TrackingError(f"tracking.experiment: {tracking.experiment} was deleted in MLflow; {mend}")
                 return
             if not tracking.uri:
                 # MLflow makes a path in a call absolute, so artifacts would stay behind when the folder is moved.

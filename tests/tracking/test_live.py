@@ -220,12 +220,12 @@ def broken_database() -> Iterator[str]:
 
 
 @contextmanager
-def refusing_server() -> Iterator[str]:
-    """Asks for a password."""
+def refusing_server(status: int = 401) -> Iterator[str]:
+    """Asks for a password, or says its version."""
 
     class Refusal(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            self.send_error(401)
+            self.send_error(401) if status == 401 else self.wfile.write(b"HTTP/1.0 200 OK\r\n\r\n2.22.1")
 
     with ThreadingHTTPServer(("127.0.0.1", 0), Refusal) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -239,6 +239,10 @@ def refusing_server() -> Iterator[str]:
         (silent_server, r"http://127\.0\.0\.1:\d+: TimeoutError: timed out"),
         (closed_port, r"http://127\.0\.0\.1:\d+: ConnectionRefusedError: .*refused"),
         (refusing_server, r"http://\*\*\*@127.*401.*MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD"),
+        (
+            partial(refusing_server, 200),
+            r"tracking\.uri: http://\*\*\*@127.* is MLflow 2\.22\.1; name one of 3 or newer",
+        ),
         (broken_database, r"mlflow\.db: .*file is not a database"),
         (partial(nullcontext, "htp://ada:S3cret@nowhere"), r"htp://\*\*\*@nowhere: .*unsupported URI"),
     ],
@@ -257,7 +261,7 @@ def test_out_of_reach_costs_one_warning_and_one_call(
             assert callbacks == []
         monkeypatch.undo()
         monkeypatch.chdir(chain.folder)
-        with pytest.raises(TrackingError, match="octopi publish` tries again") as refused:
+        with pytest.raises(TrackingError, match="octopi publish` tries again|of 3 or newer") as refused:
             publish(params)
     assert (os.environ["MLFLOW_HTTP_REQUEST_MAX_RETRIES"], os.environ["MLFLOW_HTTP_REQUEST_TIMEOUT"]) == ("0", "1")
     assert trained.history == untracked.history
