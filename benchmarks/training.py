@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from contextlib import chdir
 from pathlib import Path
-from typing import Any
 
 from benchmarks.table import Row, make_rows
-from pipeline.config.params import PARAMS_FILE, load_params
+from pipeline.config.params import load_params
 from pipeline.core.errors import UserError
-from pipeline.core.io import read_json
-from pipeline.core.stage import RUNS
+from pipeline.tracking.chain import ChainStage, read_stages
 
 ENCODER, LANGUAGE = "training an encoder", "training a language model"
 TRAININGS = {"pretrain": ENCODER, "finetune_encoder": ENCODER, "align": LANGUAGE, "lora": LANGUAGE}
@@ -28,24 +26,26 @@ def measure(root: Path) -> list[Row]:
     """Minutes of each training in `root`/runs, and its peak of memory: the device's, on a processor the host's.
 
     Raises:
-        UserError: where no training is in runs/.
+        UserError: where dvc.lock has none that ran here.
     """
-    found: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
-    for file in sorted((root / RUNS).glob("*.json")):
-        stage, _, key = file.stem.partition("@")
-        if stage in TRAININGS:
+    found = {question: dict[str, list[ChainStage]]() for question in PUBLISHED}
+    with chdir(root):
+        stages = read_stages(params := load_params())
+    for title, last in sorted(stages.items()):
+        stage, _, key = title.partition("@")
+        if stage in TRAININGS and last.ran:
             # A variant's alignment and its LoRA make one model.
             name = key if TRAININGS[stage] == LANGUAGE else f"{stage} {key}".strip()
-            found[TRAININGS[stage], name].append(read_json(file))
-    if not found:
-        raise UserError(f"{root / RUNS}: no training ran here; run `make repro` first")
-    report, rows = load_params(root / PARAMS_FILE).report_name, list[Row]()
+            found[TRAININGS[stage]].setdefault(name, []).append(last)
+    if not any(found.values()):
+        raise UserError(f"{root}: no training ran here; run `make repro` first")
+    rows = list[Row]()
     for question, published in PUBLISHED.items():
         known = dict(published)
-        for (kind, name), runs in found.items():
-            if kind == question:
-                minutes, peak = sum(r["seconds"] for r in runs) / 60, max(r["peak_memory_mb"] for r in runs)
-                known[f"{report}, {name}"] = minutes, peak * 2**20 / 1e6, runs[-1].get("device", "not recorded")
+        for name, runs in found[question].items():
+            minutes = sum(run.metrics["system/seconds"] for run in runs) / 60
+            peak = max(run.metrics["system/peak_memory_mb"] for run in runs)
+            known[f"{params.report_name}, {name}"] = minutes, peak * 2**20 / 1e6, runs[-1].device
         made = make_rows(
             question,
             {name: [minutes] for name, (minutes, _, _) in known.items()},

@@ -14,13 +14,14 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
 
 from pipeline.config import Params
-from pipeline.config.params import PARAMS_FILE, load_params
+from pipeline.config.params import CHAIN, PARAMS_FILE, load_params
 from pipeline.core.errors import UserError
 from pipeline.core.io import code_of, remove_rests, sha256, write_json
 from pipeline.core.parallel import end_with_parent, use_backend
@@ -218,7 +219,7 @@ def _main_process() -> bool:
 
 
 def _write_run(running: Stage) -> None:
-    """Write runs/NAME.json: times, seconds, device, most memory in MiB (the GPU's, where one was used) and metrics."""
+    """Write runs/NAME.json: times, seconds, device, most memory in MiB (a GPU's, if one was used), metrics, outputs."""
     import psutil
 
     peak = 0.0
@@ -240,5 +241,24 @@ def _write_run(running: Stage) -> None:
             "device": device,
             "peak_memory_mb": round(peak, 1),
             "metrics": running.metrics,
+            "outs": _outs(running),
         },
     )
+
+
+def _outs(running: Stage) -> dict[str, str]:
+    """Hashes of a stage's outputs by path, as dvc.lock will have them: other runs' have others."""
+    import yaml
+    from dvc_data.hashfile.build import build
+    from dvc_data.hashfile.db import HashFileDB
+    from dvc_objects.fs.local import localfs
+
+    name, _, key = running.name.partition("@")
+    listed = yaml.safe_load(CHAIN.read_bytes())["stages"].get(name, {}) if CHAIN.is_file() else {}
+    outs = [str(*out) if isinstance(out, dict) else out for kind in ("outs", "metrics") for out in listed.get(kind, ())]
+    # A stage of a matrix is called by its values with hyphens between, as what it writes is.
+    named = re.sub(r"\$\{item\..*\}", key, "\n".join(outs))
+    paths = re.sub(r"\$\{([\w.]+)\}", lambda name: str(attrgetter(name[1])(running.params)), named).splitlines()
+    made = {path: os.path.abspath(path) for path in paths if Path(path).exists()}
+    cache = HashFileDB(localfs, "")  # Of which a dry run has no use.
+    return {path: build(cache, at, localfs, "md5", dry_run=True)[2].hash_info.value for path, at in made.items()}

@@ -24,16 +24,17 @@ REPORTS, CHAIN_LOCK = Path("reports"), Path("dvc.lock")
 
 
 class ChainStage(NamedTuple):
-    """A stage as dvc.lock has it for these parameters, and the last time that it really ran here."""
+    """A stage as dvc.lock has it for these parameters, and the run here that made it."""
 
     lock: str
     """Hash of its entry in dvc.lock."""
     outs: dict[str, str]
     """Path to hash of what it made."""
     ran: tuple[int, int] | None
-    """Start and end in milliseconds since 1970, as all times here; None where DVC only ever restored it."""
+    """Start and end in milliseconds since 1970, as all times here; None where DVC restored it, and another ran last."""
     metrics: dict[str, float]
     """The stage's own, and what it cost: `system/seconds`, `system/startup_seconds`, `system/peak_memory_mb`."""
+    device: str = ""
 
 
 def read_stages(params: Params) -> dict[str, ChainStage]:
@@ -46,14 +47,13 @@ def read_stages(params: Params) -> dict[str, ChainStage]:
         used = dict(flatten((entry.get("params") or {}).get(str(PARAMS_FILE)) or {}))
         if title.partition("@")[0] in chain and used.items() <= today.items():
             outs = {out["path"]: str(out.get("md5")) for out in entry.get("outs") or ()}
-            ran, metrics, path = None, {}, RUNS / f"{title}.json"
-            if path.is_file():
-                run = read_json(path)
+            made, path = ChainStage(digest(entry), outs, None, {}), RUNS / f"{title}.json"
+            if path.is_file() and (run := read_json(path)).get("outs") == outs:
                 began, ended = (datetime.fromisoformat(run[end]).timestamp() for end in ("started", "ended"))
-                ran = int(1000 * began), int(1000 * ended)
                 costs = {f"system/{name}": run[name] for name in ("seconds", "startup_seconds", "peak_memory_mb")}
-                metrics = {**run["metrics"], **costs}
-            found[title] = ChainStage(digest(entry), outs, ran, metrics)
+                times = int(1000 * began), int(1000 * ended)
+                made = made._replace(ran=times, metrics={**run["metrics"], **costs}, device=run["device"])
+            found[title] = made
     return found
 
 

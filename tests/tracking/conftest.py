@@ -93,8 +93,9 @@ class FakeChain:
         for index, title in enumerate(titles):
             begin = FIRST + timedelta(minutes=minutes, seconds=index * (SECONDS + 1))
             times = {"started": begin.isoformat(), "ended": (begin + timedelta(seconds=SECONDS)).isoformat()}
-            cost = {"startup_seconds": 1.5, "seconds": float(SECONDS), "peak_memory_mb": 100.0}
-            write_json(Path("runs") / f"{title}.json", {**times, **cost, "metrics": {"loss": 1.0, "answers": 5}})
+            cost = {"startup_seconds": 1.5, "seconds": float(SECONDS), "peak_memory_mb": 100.0, "device": "a card"}
+            made = {"metrics": {"loss": 1.0, "answers": 5}, "outs": {out(title): mark * 32}}
+            write_json(Path("runs") / f"{title}.json", {**times, **cost, **made})
             lock["stages"][title] = {
                 "cmd": f"python {title}",
                 "params": {"params.yaml": {"seed": 0, "frames": {"pixels": 64}}},

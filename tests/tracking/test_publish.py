@@ -17,7 +17,8 @@ from typer.testing import CliRunner
 
 from pipeline.core.io import write_table
 from pipeline.core.records import Graded
-from pipeline.tracking.chain import accuracies
+from pipeline.scales import write_params
+from pipeline.tracking.chain import accuracies, read_stages
 from pipeline.tracking.publish import publish
 from pipeline.tracking.store import TrackingError
 from tests.closure import ROOT
@@ -176,6 +177,33 @@ def test_entries_of_other_parameters_are_no_part(chain: FakeChain) -> None:
     assert set(by_name("stage")) == set(TITLES) - {"lora@base-all-0"}
 
 
+LORA = """\
+from pathlib import Path
+from pipeline.core.stage import stage
+with stage("lora", "base-0") as run:
+    Path("data/base-0/adapter").mkdir(parents=True)
+    for file in ("data/base-0/adapter/é", "data/base-0/b", "smoke.json"):
+        Path(file).write_text(str(run.params.lora.rank))
+"""
+
+
+def test_a_run_belongs_to_what_it_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rank 8 is trained, then rank 4, then rank 8 comes from DVC's cache: the run of rank 4 is not its."""
+    monkeypatch.chdir(tmp_path)
+    own = {"cmd": "python lora.py", "params": ["lora.rank"], "matrix": {"encoder": ["base"], "seed": [0]}}
+    own |= {"outs": ["data/${item.encoder}-${item.seed}"], "metrics": [{"${scale}.json": {"cache": False}}]}
+    Path("dvc.yaml").write_text(yaml.safe_dump({"vars": ["params.yaml"], "stages": {"lora": own}}))
+    Path("lora.py").write_text(LORA)
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    environment, ran = {**os.environ, "PYTHONPATH": str(ROOT), "PATH": path}, []
+    for rank in (8, 4, 8):
+        write_params(params := fake_params(f"lora.rank={rank}"))
+        command = "test -d .dvc || dvc init -q --no-scm; dvc repro -q"
+        subprocess.run(command, shell=True, check=True, env=environment)
+        ran.append(read_stages(params)["lora@base-0"].ran is not None)
+    assert ran == [True, True, False]
+
+
 def test_publishing_that_was_cut_off_goes_on(chain: FakeChain, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(mlflow.MlflowClient, "log_artifacts", lambda *_: (_ for _ in ()).throw(OSError("disk")))
@@ -195,6 +223,9 @@ def test_the_command_says_what_was_added_or_in_one_line_why_it_could_not(chain: 
     from pipeline.cli import app
 
     assert "2 variants are new" in CliRunner().invoke(app, ["publish"]).stdout
+    client().delete_experiment(client().get_experiment_by_name("octopi").experiment_id)
+    with refused("tracking.experiment: octopi was deleted"):
+        publish(chain.params)
     for text, words in (("{", "not YAML"), ("stages: [split]", "not as DVC writes it"), (None, "no such file")):
         Path("dvc.lock").unlink() if text is None else Path("dvc.lock").write_text(text)
         with refused(f"dvc.lock: {words}"):
