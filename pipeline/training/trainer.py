@@ -86,7 +86,8 @@ class TrainableTrainer(Trainer):
             ]
             # A parameter without a group would stay as it was drawn, and nothing would show.
             assert sum(len(group["params"]) for group in groups) == len(trained), f"rates for {list(self._rates)} alone"
-            self.optimizer = torch.optim.AdamW(groups, weight_decay=self.args.weight_decay)
+            # Fused, as the Trainer's own: MKL's roots, which it takes else, depend on the maker of the processor.
+            self.optimizer = torch.optim.AdamW(groups, weight_decay=self.args.weight_decay, fused=True)
         return self.optimizer
 
     def create_scheduler(
