@@ -27,18 +27,17 @@ if __name__ == "__main__":
         model = replace(source, device=device_here(device))()
         asked = DATA / "questions" / str(variant.seed)
         questions = read_jsonl(asked / "evaluation.jsonl", Question)
-        words = variant.encoder is Encoder.WORDS
-        if words:
+        if variant.encoder is Encoder.WORDS:
             questions = in_words(questions, store, load_catalogue(Path(params.data.catalogue)))
-        for touch in (Touch.REAL, *(params.ablation.touch if variant.full else ())):
-            per_video = 0 if words or touch is Touch.REMOVED else params.frames.per_video
-            given = ablate_input(store, touch, questions, variant.seed)
-            predictions = answer(model, given, questions, variant.opd, language, per_video, source)
+        per_video = params.frames.per_video
+        for touch in params.ablation.touches(variant):
+            given, shown = ablate_input(store, touch, questions, variant.seed)
+            predictions = answer(model, given, shown, variant.opd, language, per_video, source)
             write_jsonl(DATA / "answers" / variant.key / f"{touch}.jsonl", predictions)
             run.metrics[f"{touch}.answers"] = len(predictions)
             run.metrics[f"{touch}.tokens"] = sum(p.tokens for p in predictions)
             run.metrics[f"{touch}.truncated"] = sum(p.truncated for p in predictions)
             if variant.full and touch is Touch.REAL:
                 examples = read_jsonl(asked / "examples.jsonl", Question)
-                shown = answer(model, store, examples, variant.opd, language, per_video, source)
-                write_jsonl(DATA / "answers" / variant.key / "examples.jsonl", shown)
+                told = answer(model, store, examples, variant.opd, language, per_video, source)
+                write_jsonl(DATA / "answers" / variant.key / "examples.jsonl", told)

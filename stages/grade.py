@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from pipeline.core.io import read_jsonl, write_table
-from pipeline.core.records import Graded, GradedVision, Prediction, Question, Touch
+from pipeline.core.records import Graded, GradedVision, Prediction, Question
 from pipeline.core.stage import DATA, stage
 from pipeline.videos.catalogue import load_catalogue
 
@@ -17,7 +17,7 @@ if __name__ == "__main__":
         for variant in run.params.ablation.variants():
             questions = read_jsonl(DATA / "questions" / str(variant.seed) / "evaluation.jsonl", Question)
             replicate = run.params.split.replicate_of(variant.seed)
-            for touch in (Touch.REAL, *(run.params.ablation.touch if variant.full else ())):
+            for touch in run.params.ablation.touches(variant):
                 predictions = read_jsonl(DATA / "answers" / variant.key / f"{touch}.jsonl", Prediction)
                 whose = {**variant._asdict(), "seed": replicate, "trained": variant.seed, "touch": touch}
                 graded += [Graded(**score.model_dump(), **whose) for score in grade(questions, predictions, catalogue)]

@@ -27,7 +27,6 @@ from pipeline.core.records import (
     Prediction,
     Question,
     Severity,
-    Touch,
     Video,
 )
 from pipeline.evaluation.grading import grade
@@ -97,7 +96,7 @@ def write_run(root: Path, params: Params, *, objects: Sequence[str] = (), skill:
             examples = build_examples(splits[variant.seed], catalogue, seed=0)
             told = [p for q in examples if (p := _say(q, variant.opd, skill, rng))]
             write_jsonl(data / "answers" / variant.key / "examples.jsonl", told)
-        for touch in (Touch.REAL, *(params.ablation.touch if variant.full else ())):
+        for touch in params.ablation.touches(variant):
             answers = [p for q in questions if (p := _say(q, variant.opd, skill, rng))]
             write_jsonl(data / "answers" / variant.key / f"{touch}.jsonl", answers)
             whose = {**variant._asdict(), "seed": replicate, "trained": variant.seed, "touch": touch}

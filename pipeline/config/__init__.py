@@ -405,6 +405,10 @@ class AblationConfig(Section):
         chosen = product(self.seeds, self.encoders, self.lora, self.opd)
         return [Variant(encoder, lora, opd, seed) for seed, encoder, lora, opd in chosen]
 
+    def touches(self, variant: Variant) -> tuple[Touch, ...]:
+        """What a variant is asked with: the questions' videos, and the full system also with every input ablation."""
+        return (Touch.REAL, *(self.touch if variant.full else ()))
+
 
 class TrackingConfig(Section):
     """MLflow."""

@@ -10,7 +10,7 @@ import torch
 
 from pipeline.core.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
 from pipeline.core.records import Question
-from pipeline.language.chat import TACTILE
+from pipeline.language.conversations import without_videos
 from pipeline.videos.catalogue import Catalogue
 
 
@@ -44,15 +44,7 @@ def in_words(questions: Sequence[Question], store: EmbeddingStore, catalogue: Ca
             f"({', '.join(p.levels[level] for p, (level, _) in zip(catalogue.properties, said(video), strict=True))})"
             for video in question.videos
         ]
-        dialogues = []
-        for dialogue in question.dialogues:
-            left, turns = iter(texts), []
-            for turn in dialogue.turns:
-                first, *rest = turn.user.split(TACTILE)
-                user = first + "".join(next(left) + part for part in rest)
-                turns.append(turn.model_copy(update={"user": user}))
-            dialogues.append(dialogue.model_copy(update={"turns": tuple(turns)}))
-        changed.append(question.model_copy(update={"dialogues": tuple(dialogues)}))
+        changed.append(without_videos(question, texts))
     return changed
 
 

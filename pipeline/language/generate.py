@@ -75,7 +75,7 @@ def answer(
     end token, or is cut (and marked so) after `max_new_tokens` or where the language model has no more positions.
 
     Args:
-        per_video: Frames a video; 0 asks without touch.
+        per_video: Frames a video.
         source: Of the model, for the workers of a cluster.
 
     Raises:

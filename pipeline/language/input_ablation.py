@@ -1,4 +1,4 @@
-"""Input ablations: stores that return other embeddings than the videos' own, to test whether answers use touch."""
+"""Input ablations: questions and a store that give other touch than the videos' own, to test whether answers use it."""
 
 from __future__ import annotations
 
@@ -12,21 +12,27 @@ from pipeline.core.embeddings import EmbeddingStore
 from pipeline.core.errors import UserError
 from pipeline.core.records import Question, Touch
 from pipeline.core.runtime import derive_seed
+from pipeline.language.chat import TACT_END, TACT_START
+from pipeline.language.conversations import without_videos
 
 
-def ablate_input(store: EmbeddingStore, touch: Touch, questions: Sequence[Question], seed: int) -> EmbeddingStore:
-    """The store that a variant reads the questions' videos from.
+def ablate_input(
+    store: EmbeddingStore, touch: Touch, questions: Sequence[Question], seed: int
+) -> tuple[EmbeddingStore, Sequence[Question]]:
+    """The store that a variant reads the questions' videos from, and the questions.
 
+    - `removed`: the two delimiters stand in each video's place, with nothing between them.
     - `swapped`: the objects of the questions are put in a random ring and each gets the embeddings of the next, so no
       object keeps its own. The next one may still have the same classes.
     - `noise`: normal noise with the mean and deviation of each dimension over all embeddings, the same at each call.
-    - `removed` returns the store unchanged: the prompt leaves the frames out.
 
     Raises:
         UserError: where touch is to be swapped, and the questions are about one object alone.
     """
-    if touch not in (Touch.SWAPPED, Touch.NOISE):
-        return store
+    if touch is Touch.REAL:
+        return store, questions
+    if touch is Touch.REMOVED:
+        return store, [without_videos(q, [TACT_START + TACT_END] * len(q.videos)) for q in questions]
     found: dict[str, set[str]] = {}
     for question in questions:
         for object_id, video_id in zip(question.objects, question.videos, strict=True):
@@ -45,10 +51,10 @@ def ablate_input(store: EmbeddingStore, touch: Touch, questions: Sequence[Questi
             for own, other in zip(ring, ring[1:] + ring[:1], strict=True)
             for i, video in enumerate(videos[own])
         }
-        return store.with_rows(rows, store.tensor)
+        return store.with_rows(rows, store.tensor), questions
     names = list(chain.from_iterable(videos.values()))
     ends = list(accumulate(map(store.count, names), initial=0))
     drawn = torch.Generator().manual_seed(derive_seed(seed, "noise"))
     noise = torch.randn(ends[-1], store.dim, generator=drawn)
     tensor = store.tensor.mean(0) + store.tensor.std(0, correction=0) * noise
-    return store.with_rows({v: range(*span) for v, span in zip(names, pairwise(ends), strict=True)}, tensor)
+    return store.with_rows({v: range(*span) for v, span in zip(names, pairwise(ends), strict=True)}, tensor), questions

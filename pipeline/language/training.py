@@ -71,7 +71,7 @@ class Material:
             catalogue=load_catalogue(catalogue),
             opd=opd,
             language=params.language.model_copy(update={"dtype": dtype}),
-            per_video=0 if words else params.frames.per_video,
+            per_video=params.frames.per_video,
             words=words,
             flip_probability=params.encoder.flip_probability,
             seed=params.seed + seed,
@@ -83,7 +83,7 @@ class Material:
     def fingerprint(self, config: TrainConfig, *inputs: Path) -> str:
         """A short hash of all that a training depends on; `inputs` are files of what was trained before."""
         settings = (config, self.language, self.opd, self.per_video, str(self.flip_probability), self.seed)
-        return fingerprint(*settings, Path(self.language.weights), *self.files, *inputs)
+        return fingerprint(*settings, str(self.words), Path(self.language.weights), *self.files, *inputs)
 
 
 def assemble(
@@ -213,7 +213,9 @@ def write_model_card(folder: Path, material: Material, data: ConversationDataset
         f"Octopi: a language model with touch, {'fine-tuned with LoRA' if lora else 'aligned'}",
         bases={"language model": Path(material.language.weights)},
         data={
-            "tactile embeddings": f"{material.store.folder.name}, {material.per_video} frames a video",
+            "tactile embeddings": "none"
+            if material.words
+            else f"{material.store.folder.name}, {material.per_video} frames a video",
             "questions": ", ".join(f"{count} {task}" for task, count in sorted(tasks.items())),
             "objects": len({o for q in data.questions for o in q.objects}),
             f"videos ({material.source})": len({v for q in data.questions for v in q.videos}),

@@ -80,6 +80,7 @@ def test_in_words_each_video_is_what_its_heads_say(
     told = in_words(questions, store, CATALOGUE)
     assert [q.question_id for q in told] == [q.question_id for q in questions]
     for before, after in zip(questions, told, strict=True):
+        assert after.videos == (), "no embedding is read"
         words = []
         for video in before.videos:
             found = [shares(logits[video], place) for place in range(3)]
