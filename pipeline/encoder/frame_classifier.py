@@ -62,13 +62,18 @@ class JointFrameClassifier(PropertyClassifier):
     def classify(self, features: torch.Tensor) -> list[torch.Tensor]:
         """Log of the mean probability a property, batch x classes, of features, batch x frames x dim."""
         logits: list[torch.Tensor] = self.heads(self.standardise(features))
-        # In logarithms throughout: a frame that is sure of a class gives the others a probability of 0 in float32.
-        return [z.log_softmax(-1).logsumexp(1) - torch.tensor(float(z.shape[1])).log() for z in logits]
+        return [pooled(z) for z in logits]
 
     def decide(self, logits: torch.Tensor) -> torch.Tensor:
         """The most probable combination: int64, batch x properties."""
         evidence = [z.log_softmax(1).numpy() for z in logits.detach().cpu().double().split(self.classes, dim=1)]
         return torch.from_numpy(decode_jointly(evidence, self.dependence.cpu().double().numpy()))
+
+
+def pooled(logits: torch.Tensor) -> torch.Tensor:
+    """Log of the mean probability over frames, batch x classes, from batch x frames x classes."""
+    # In logarithms throughout: a frame that is sure of a class gives the others a probability of 0 in float32.
+    return logits.log_softmax(-1).logsumexp(1) - torch.tensor(float(logits.shape[1]), dtype=logits.dtype).log()
 
 
 @dataclass(frozen=True)
@@ -89,11 +94,9 @@ class FittedHeads:
 
     def evidence(self, clips: Clips) -> list[npt.NDArray[np.float64]]:
         """Log of the mean probability over frames, videos x classes of each property."""
-        from scipy.special import log_softmax, logsumexp
-
         scaled = np.clip((clips - self.centre) / self.spread, -FARTHEST, FARTHEST).astype(np.float64)
         logits = [scaled @ w.T + b for w, b in zip(self.weights, self.biases, strict=True)]
-        return [logsumexp(log_softmax(z, axis=-1), axis=1) - np.log(clips.shape[1]) for z in logits]
+        return [pooled(torch.from_numpy(z)).numpy() for z in logits]
 
     def predict(self, clips: Clips) -> Labels:
         """The most probable combination, videos x properties."""

@@ -8,15 +8,14 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import av
 import cv2
 import numpy as np
 
 from pipeline.core.errors import UserError
 from pipeline.use.model import with_marks
 from pipeline.videos.audit.files import FOUND
-from pipeline.videos.frames.reference import LONGEST, contact_strength, starts_touching, thumbnail
-from pipeline.videos.importing.presses import RELEASED, ROUNDING, SHORTEST, Shot, film, mean
+from pipeline.videos.frames.reference import LONGEST, contact_strength, starts_touching
+from pipeline.videos.importing.presses import RELEASED, SHORTEST, Shot, begins_at, film, mean
 
 if TYPE_CHECKING:
     from pipeline.use.model import Octopi
@@ -79,12 +78,12 @@ def presses(shots: Iterable[Shot], times: float = FOUND) -> Iterator[list[Shot]]
     gone: UserError | None = None
     try:
         for shot in shots:
-            thumb = thumbnail(av.VideoFrame.from_ndarray(shot.picture, format="bgr24").reformat(format="yuv444p"))
+            thumb = shot.thumb()
             if len(before) < LONGEST:
                 before.append((shot, thumb))
                 continue
             strength = contact_strength(thumb, mean([old for _, old in list(before)[:LONGEST]]))
-            threshold = times * max(ROUNDING, float(np.median(quiet or [0])))
+            threshold = begins_at(float(np.median(quiet or [0])), times)
             if not press and (strength <= threshold or len(quiet) < LONGEST):
                 before.append((shot, thumb))
                 quiet.append(strength)

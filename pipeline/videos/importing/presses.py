@@ -86,6 +86,10 @@ class Shot:
     recorded: int
     stamped: int
 
+    def thumb(self) -> Image:
+        """The small picture that contact is measured on."""
+        return thumbnail(av.VideoFrame.from_ndarray(self.picture, format="bgr24").reformat(format="yuv444p"))
+
 
 def cut(
     read: Callable[[], Iterator[Shot]],
@@ -270,8 +274,7 @@ def _measure(source: Iterator[Shot]) -> tuple[list[int], list[int], npt.NDArray[
     for shot in source:
         stamped.append(shot.stamped)
         received.append(shot.recorded)
-        frame = av.VideoFrame.from_ndarray(shot.picture, format="bgr24")
-        thumbs.append(thumbnail(frame.reformat(format="yuv444p")))
+        thumbs.append(shot.thumb())
     places, cold = reference_indices(len(thumbs)), unsteady_frames(thumbs, len(thumbs)) % len(thumbs)
     first, last = mean([thumbs[cold + i] for i in places]), mean([thumbs[-1 - i] for i in places])
     reference = last if starts_touching(first, last) else first
@@ -285,9 +288,13 @@ def mean(thumbs: Iterable[Image]) -> Image:
     return rounded
 
 
+def begins_at(quiet: float, times: float) -> float:
+    """The strength that a press begins at, by the recording's quiet level."""
+    return times * max(ROUNDING, quiet)
+
+
 def _threshold(strengths: npt.NDArray[np.float64], times: float) -> float:
-    """The strength that a press begins at."""
-    return times * max(ROUNDING, float(np.quantile(strengths, QUIET)))
+    return begins_at(float(np.quantile(strengths, QUIET)), times)
 
 
 def _rate(name: str, stamped: Sequence[int], received: Sequence[int]) -> float:
