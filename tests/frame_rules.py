@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from typing import NamedTuple
+from unittest.mock import patch
 
 import av
 import cv2
@@ -13,11 +17,14 @@ import numpy as np
 from PIL import Image as Pillow
 
 from pipeline.config import FramesConfig
+from pipeline.core.records import Probe
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.decoding import Decoder, picture, planes
 from pipeline.videos.files import VideoFile
 from pipeline.videos.frames.extract import Extraction, extract_frames
+from pipeline.videos.frames.probe import probe
 from pipeline.videos.frames.scan import Scan, scan
+from pipeline.videos.frames.selection import Kept
 
 CONFIG = FramesConfig(pixels=16)
 FILES = ("frames.npy", "references.npy", "frames.parquet", "probes.parquet")
@@ -55,10 +62,32 @@ def frames_of(path: Path) -> list[av.VideoFrame]:
         return list(decoder.frames())
 
 
-def scanned(path: Path, config: FramesConfig = CONFIG, video_id: str = "rug_0") -> Scan:
-    found = scan(VideoFile(path, path.name, video_id.rpartition("_")[0], video_id), config)
+class Scanned(NamedTuple):
+    """What is kept of a video, and what is measured of it."""
+
+    kept: tuple[Kept, ...]
+    reference: np.ndarray
+    probe: Probe
+
+
+def scanned(path: Path, config: FramesConfig = CONFIG, video_id: str = "rug_0") -> Scanned:
+    file = VideoFile(path, path.name, video_id.rpartition("_")[0], video_id)
+    found = scan(file, config)
     assert isinstance(found, Scan)
-    return found
+    return Scanned(found.kept, found.reference, probe(file, found))
+
+
+@contextmanager
+def promising(frames: int) -> Iterator[None]:
+    """Headers that promise so many frames."""
+    init = Decoder.__init__
+
+    def lying(self: Decoder, path: Path) -> None:
+        init(self, path)
+        self.header = replace(self.header, frames=frames)
+
+    with patch.object(Decoder, "__init__", lying):
+        yield
 
 
 def salience(frames: Sequence[np.ndarray], fraction: str) -> list[tuple[int, float]]:

@@ -48,30 +48,30 @@ def read_touch(video: Video, frames: FramesConfig, quiet: float) -> Touch:
         found = scan(VideoFile(path, name, object_id="", video_id=path.stem), frames)
     if isinstance(found, Finding):
         raise UserError(f"{name}: {found.measured}")
-    if found.probe.frames < FEWEST or not found.kept:
-        raise UserError(f"{name}: {found.probe.frames} frames show no touch; record from before the contact to its end")
+    if found.frames < FEWEST or not found.kept:
+        raise UserError(f"{name}: {found.frames} frames show no touch; record from before the contact to its end")
     chosen = [found.kept[place] for place in sample_evaluation(len(found.kept), frames.per_video)]
     pictures = np.stack([kept.image for kept in chosen])
     difference = subtract(pictures, found.reference)
     beyond = np.abs(difference.astype(np.int16) - MIDDLE).max(axis=3) > GAIN * TOUCHED
-    notes, probe = [], found.probe
-    if probe.contact <= quiet:
-        notes.append(f"nothing touches the sensor: strength {probe.contact:.2f}, where noise alone has {quiet:.2f}")
-    elif probe.contact <= FOUND * (noise := max(quiet, probe.quiet)):
-        notes.append(f"little touches the sensor: strength {probe.contact:.2f}, where noise alone has {noise:.2f}")
-    if probe.unsteady:
-        notes.append(f"the light is {unsteady(probe)}")
-    if probe.hdr:
+    notes, header = list[str](), found.look.header
+    if found.contact <= quiet:
+        notes.append(f"nothing touches the sensor: strength {found.contact:.2f}, where noise alone has {quiet:.2f}")
+    elif found.contact <= FOUND * (noise := max(quiet, found.quiet)):
+        notes.append(f"little touches the sensor: strength {found.contact:.2f}, where noise alone has {noise:.2f}")
+    if found.unsteady:
+        notes.append(f"the light is {unsteady(found.unsteady, found.frames)}")
+    if header.hdr:
         notes.append("recorded in HDR, which looks flat beside other videos; record or export it in SDR")
-    if probe.header_frames > probe.frames:
-        notes.append(f"damaged: only {probe.frames} of its {probe.header_frames} frames decode")
+    if header.frames > found.frames:
+        notes.append(f"damaged: only {found.frames} of its {header.frames} frames decode")
     return Touch(
         frames=pictures,
         numbers=tuple(kept.index for kept in chosen),
         reference=found.reference,
         difference=difference,
         contact=float(beyond.mean(axis=(1, 2)).max()),
-        strength=probe.contact,
+        strength=found.contact,
         notes=tuple(notes),
     )
 

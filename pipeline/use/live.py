@@ -14,8 +14,8 @@ import numpy as np
 from pipeline.core.errors import UserError
 from pipeline.use.model import with_marks
 from pipeline.videos.audit.files import FOUND
-from pipeline.videos.frames.reference import LONGEST, contact_strength, starts_touching
-from pipeline.videos.importing.presses import RELEASED, SHORTEST, Shot, begins_at, film, mean
+from pipeline.videos.frames.reference import LONGEST, contact_strength, mean, starts_touching
+from pipeline.videos.importing.presses import RELEASED, SHORTEST, Shot, begins_at, film
 
 if TYPE_CHECKING:
     from pipeline.use.model import Octopi

@@ -13,10 +13,9 @@ from pipeline.config import FramesConfig
 from pipeline.use.frames import read_touch
 from pipeline.videos.decoding import fit, planes
 from pipeline.videos.frames.reference import LONGEST, MOST_FRAMES, reference_indices, thumbnail
-from pipeline.videos.frames.scan import Scan
 from pipeline.videos.frames.subtraction import subtract
 from tests.conftest import encode, write_video
-from tests.frame_rules import decode, frames_of, scanned
+from tests.frame_rules import Scanned, decode, frames_of, scanned
 from tests.numerics.test_frames import subtracted
 
 WIDTH, HEIGHT = 120, 90
@@ -34,7 +33,7 @@ def film(depths: list[float], seed: int = 0, light: list[float] | None = None) -
     return frames
 
 
-def filmed(path: Path, frames: list[np.ndarray], name: str = "contact", *, lossless: bool = False) -> Scan:
+def filmed(path: Path, frames: list[np.ndarray], name: str = "contact", *, lossless: bool = False) -> Scanned:
     (encode if lossless else write_video)(path, frames)
     return scanned(path, FramesConfig(pixels=32, selection=name))
 

@@ -59,11 +59,11 @@ def touches(probe: Probe, level: float) -> bool:
     return probe.contact > FOUND * level
 
 
-def unsteady(probe: Probe) -> str:
-    """What is to be said of a video whose light changes in its first frames."""
-    if probe.unsteady == probe.frames:
+def unsteady(first: int, frames: int) -> str:
+    """What is to be said of a video whose light changes in its first frames, of so many."""
+    if first == frames:
         return "never steady: contact may be light"
-    return f"not steady in the first {probe.unsteady} frames, which are left out"
+    return f"not steady in the first {first} frames, which are left out"
 
 
 def _overview(probes: Sequence[Probe], catalogue: Catalogue) -> Iterator[Finding]:
@@ -113,7 +113,7 @@ def _each(probes: Sequence[Probe]) -> Iterator[Finding]:
             ("brightness", p.brightness_step > STEP, f"a step of {p.brightness_step:.1f} of 255", f"at most {STEP:g}"),
             ("saturation", p.saturated > SATURATED, f"{100 * p.saturated:.0f} % of values at 0 or 255", bright),
             ("frames kept", p.kept == 0, "0", "5 or more, by frames.selection"),
-            ("light at the start", p.unsteady, unsteady(p), "steady"),
+            ("light at the start", p.unsteady, unsteady(p.unsteady, p.frames), "steady"),
             ("contact at the start", p.starts_touching, from_end, "untouched"),
             ("contact", not touched, f"not found: strength {p.contact:.2f}", f"over {FOUND * level:.2f}"),
             ("contact at the end", pressed, f"still {p.contact_end:.2f} of {p.contact:.2f}", f"under {released:.2f}"),

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
-from functools import partial
 from pathlib import Path
 
 from pipeline.config import FramesConfig, SplitConfig
@@ -17,7 +16,8 @@ from pipeline.videos.audit.labels import check_labels
 from pipeline.videos.audit.leakage import check_leakage
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import VideoFile, list_videos
-from pipeline.videos.frames.scan import Scan, scan
+from pipeline.videos.frames.probe import probe
+from pipeline.videos.frames.scan import scan
 from pipeline.videos.split import assign
 
 AUDIT_FILE = "audit.csv"
@@ -88,7 +88,11 @@ def summary(findings: Sequence[Finding]) -> dict[str, float]:
 
 
 def _scan_all(files: Sequence[VideoFile]) -> tuple[list[Probe], list[Finding]]:
+    results = list(run_parallel(_probe, files, "videos", "video"))
+    return [r for r in results if isinstance(r, Probe)], [r for r in results if isinstance(r, Finding)]
+
+
+def _probe(file: VideoFile) -> Probe | Finding:
     # The pictures are not wanted here: the smallest size, and hardly any of them.
-    look = partial(scan, config=FramesConfig(pixels=16, fraction=0.01))
-    results = list(run_parallel(look, files, "videos", "video"))
-    return [r.probe for r in results if isinstance(r, Scan)], [r for r in results if isinstance(r, Finding)]
+    found = scan(file, FramesConfig(pixels=16, fraction=0.01))
+    return found if isinstance(found, Finding) else probe(file, found)

@@ -21,6 +21,7 @@ from pipeline.core.parallel import run_parallel
 from pipeline.core.records import Finding, Frame, Probe, Record, Severity, Video
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import VideoFile, list_videos, raise_errors
+from pipeline.videos.frames.probe import probe
 from pipeline.videos.frames.scan import scan
 from pipeline.videos.frames.store import FRAMES_FILE, PROBES_FILE, REFERENCES_FILE, TABLE_FILE
 
@@ -71,12 +72,12 @@ def extract_frames(folder: Path, catalogue: Catalogue, config: FramesConfig, out
         if isinstance(result, Finding):
             raise_errors(folder, [result])
             continue
-        found[file], probe = result, result.probe
-        if probe.header_frames > probe.frames:
-            lost = f"{probe.frames} of the {probe.header_frames} frames in its header decode"
-            log.warning("%s: %s; is it cut off? The %d are used", file, lost, probe.frames)
-        if probe.kept == 0:
-            log.warning("%s: %d frames are too few for frames.selection=release; left out", file, probe.frames)
+        found[file], measured = result, result.probe
+        if measured.header_frames > measured.frames:
+            lost = f"{measured.frames} of the {measured.header_frames} frames in its header decode"
+            log.warning("%s: %s; is it cut off? The %d are used", file, lost, measured.frames)
+        if measured.kept == 0:
+            log.warning("%s: %d frames are too few for frames.selection=release; left out", file, measured.frames)
     if [_stamp(file) for file in list_videos(folder, catalogue).files] != stamps:
         # DVC would take the folder as it is now for the one that was read.
         raise UserError(f"{folder}: videos were added or changed while they were read; run it again, which goes on")
@@ -132,7 +133,7 @@ def _work(file: VideoFile, config: FramesConfig, work: Path) -> _Done | Finding:
     result = scan(file, config)
     if isinstance(result, Finding):
         return result
-    done = _Done(stamp=stamp, probe=result.probe, places=tuple((kept.index, kept.score) for kept in result.kept))
+    done = _Done(stamp=stamp, probe=probe(file, result), places=tuple((kept.index, kept.score) for kept in result.kept))
     pixels = {"reference": result.reference}
     if result.kept:
         pixels["frames"] = np.stack([kept.image for kept in result.kept])

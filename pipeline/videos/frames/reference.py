@@ -60,6 +60,12 @@ def is_steady(thumbs: Sequence[Image]) -> bool:
     return True
 
 
+def mean(pictures: Sequence[Image]) -> Image:
+    """The mean picture, rounded."""
+    rounded: Image = np.rint(np.mean(pictures, axis=0)).astype(np.uint8)
+    return rounded
+
+
 def thumbnail(frame: av.VideoFrame, channels: int = 3) -> Image:
     """A frame with its longer side at `THUMB` pixels: uint8, height x width x (brightness, two colour differences).
 

@@ -10,7 +10,7 @@ import logging
 import math
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from functools import partial
@@ -34,6 +34,7 @@ from pipeline.videos.film import write_film
 from pipeline.videos.frames.reference import (
     LONGEST,
     contact_strength,
+    mean,
     reference_indices,
     starts_touching,
     thumbnail,
@@ -280,12 +281,6 @@ def _measure(source: Iterator[Shot]) -> tuple[list[int], list[int], npt.NDArray[
     reference = last if starts_touching(first, last) else first
     strengths = [contact_strength(thumb, reference) for thumb in thumbs[cold:]]
     return stamped, received, np.array([min(strengths)] * cold + strengths)
-
-
-def mean(thumbs: Iterable[Image]) -> Image:
-    """The mean picture, rounded."""
-    rounded: Image = np.rint(np.mean(list(thumbs), axis=0)).astype(np.uint8)
-    return rounded
 
 
 def begins_at(quiet: float, times: float) -> float:
