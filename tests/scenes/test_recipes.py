@@ -49,13 +49,10 @@ def test_scenes_need_their_properties(catalogue: Catalogue, tmp_path: Path) -> N
     [
         ("yoyo: {modulus: 1}", r"yoyo is not in objects\.csv; correct or remove the entry"),
         ("rug: {relief: []}", r"rug: modulus: Field required; docs/scenes\.md"),
-        ("rug:", r"rug: Input should be .*; docs/scenes\.md"),
         ("rug: {modulus: -1}", r"rug: modulus: .*greater than"),
         ("rug: {modulus: .nan}", r"rug: modulus: "),
         ("rug: {modulus: 1, body: {kind: cube}}", r"rug: body: .*cube.*'flat'"),
-        ("rug: {modulus: 1, body: {kind: round, radii: [3, 0]}}", r"rug: body\.round\.radii\.1: "),
         ("rug: {modulus: 1, body: {kind: round, radii: [.inf, 3]}}", r"rug: body\.round\.radii\.0: "),
-        ("rug: {modulus: 1, relief: [{kind: fur}]}", r"rug: relief\.0: .*fur.*'rough'"),
         ("rug: {modulus: 1, relief: [{kind: rough, rms: 1}]}", r"rug: relief\.0\.rough\.longest: Field required"),
         ("- rug", r"must map object ids to recipes"),
         ("rug: {modulus: 1", r"correct it, or remove it"),

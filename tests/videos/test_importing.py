@@ -213,7 +213,6 @@ def test_what_is_no_recording_of_touch_is_refused_in_one_line(tmp_path: Path, pi
     for source, told, *options in (
         (tmp_path / "none.bag", "no such recording"),
         (bag(*quiet), "nothing touches the sensor in 78 pictures"),
-        (bag(pictures[0]), "1 pictures are no press"),
         (bag(*pictures[:2], encoding="16UC1"), "encoding '16UC1'; send one of bgr8, 8UC3, rgb8, mono8, 8UC1"),
         (bag(*pictures[:2], encoding="broken"), "is no picture that OpenCV reads"),
         (bag(pictures[0].astype(np.uint16) * 16, encoding="png"), "save it in 8 bits"),
@@ -259,13 +258,10 @@ def test_a_long_video_and_a_folder_of_pictures_are_cut_as_a_bag_is(tmp_path: Pat
     assert "rug_4.mp4" in imported(*command, long, "--whole")
     assert len(list(decode(out / "rug_4.mp4"))) == LENGTH
     cv2.imwrite(str(folder / "frame_3.png"), pictures[3][:-2])
-    (empty := tmp_path / "empty").mkdir()
     for source, options, words in (
         (folder, ["--fps", "25"], "frame_3.png: of another size"),
         (folder, [], "say --fps"),
         (folder, ["--fps", "0.5"], "--fps takes 1 to 240"),
-        (empty, ["--fps", "25"], "no picture decodes"),
-        (tmp_path / "none.mp4", [], "no such file"),
         (text, ["--fps", "25"], "no picture decodes"),
     ):
         assert re.match(f"refused: .*{re.escape(words)}", imported(*command, source, *options))

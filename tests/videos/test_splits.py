@@ -150,7 +150,6 @@ def test_a_column_is_a_split(name: str) -> None:
     [
         ({}, "paper", "split.name=paper is no split of the catalogue; allowed: kfold "),
         ({}, "development", "split.name=development needs the column split_paper; allowed: kfold "),
-        ({"mine": "paper"}, "sideways", "allowed: mine, kfold "),
         ({"paper": "paper"}, "mine", "allowed: paper, development, kfold "),
     ],
 )
