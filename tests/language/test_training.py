@@ -129,6 +129,8 @@ def test_a_checkpoint_s_key_changes_with_each_input(held: Material, tmp_path: Pa
 
     keys = [key()]
     assert key() == keys[0]
+    shutil.copytree(embeddings, embeddings.with_name("words-0"))
+    assert Material.load(data, params, Encoder.WORDS, Opd.ALL, 0).fingerprint(SMALL) != keys[0]
     write_jsonl(asked, held.questions[1:])
     keys.append(key())
     for file in (weights / "model.safetensors", embeddings / STATISTICS_FILE, catalogue / "properties.yaml"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 
 from pipeline.config import FramesConfig
 from pipeline.use.frames import read_touch
-from pipeline.videos.decoding import fit, planes
+from pipeline.videos.decoding import Decoder, fit, planes
 from pipeline.videos.frames.reference import LONGEST, MOST_FRAMES, reference_indices, thumbnail
 from pipeline.videos.frames.subtraction import subtract
 from tests.conftest import encode, write_video
@@ -124,6 +125,16 @@ def test_a_warm_up_changes_nothing_else(tmp_path: Path, name: str, gains: list[f
     assert found.probe.starts_touching == (shape == "start")
     if name != "release":
         assert min(k.index for k in found.kept) >= cold + (name == "salient"), "no difference in light is kept"
+
+
+@pytest.mark.parametrize(("gains", "opened"), [([], 1), (WARM_UP, 2)])
+def test_a_video_is_decoded_twice_at_most(tmp_path: Path, gains: list[float], opened: int) -> None:
+    """The second has no number of frames in its header, light that rises, and contact at its beginning."""
+    depths = rise(100)[::-1] if gains else rise(100)
+    path = encode(tmp_path / ("v.mkv" if gains else "v.avi"), warmed(film(depths), gains))
+    with patch.object(Decoder, "frames", autospec=True, side_effect=Decoder.frames) as decoded:
+        scanned(path)
+    assert decoded.call_count == opened
 
 
 @pytest.mark.slow
