@@ -22,7 +22,6 @@ from pipeline.core.records import (
     Finding,
     Graded,
     Measurement,
-    OutOfFold,
     Part,
     Prediction,
     Question,
@@ -102,9 +101,6 @@ def write_run(root: Path, params: Params, *, objects: Sequence[str] = (), skill:
             whose = {**variant._asdict(), "seed": replicate, "trained": variant.seed, "touch": touch}
             graded += [Graded(**s.model_dump(), **whose) for s in grade(questions, answers, catalogue)]
     write_table(data / "graded.parquet", Graded, graded)
-    for name in params.cross_validation.models:
-        records = [_out_of_fold(a, catalogue, skill, rng) for a in assignments]
-        write_table(data / "cross_validation" / name / "out_of_fold.parquet", OutOfFold, records)
     return params
 
 
@@ -123,12 +119,6 @@ def _classify(a: Assignment, catalogue: Catalogue, skill: float, rng: random.Ran
         probabilities = tuple(1 / len(p.levels) for _ in p.levels) if len(p.levels) != 3 else (0.2, 0.3, 0.5)
         said.append(classified(a.video_id, p.name, label, predicted, probabilities, a.part))
     return said
-
-
-def _out_of_fold(a: Assignment, catalogue: Catalogue, skill: float, rng: random.Random) -> OutOfFold:
-    labels = catalogue.labels(a.object_id)
-    guess = labels if rng.random() < skill else tuple(rng.randrange(len(p.levels)) for p in catalogue.properties)
-    return OutOfFold(video_id=a.video_id, object_id=a.object_id, repeat=0, expected=labels, predicted=guess)
 
 
 def _say(q: Question, opd: str, skill: float, rng: random.Random) -> Prediction | None:

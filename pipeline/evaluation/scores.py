@@ -1,5 +1,4 @@
-"""Everything measured, as the rows of tidy tables: accuracies (scores.csv), differences (effects.csv), and how far off
-encoders are (encoder_errors.csv).
+"""Everything measured, as the rows of tidy tables: accuracies (scores.csv) and differences (effects.csv).
 
 Every accuracy that a report shows is computed here; training computes its own on validation objects. A task appears
 here by itself once it is registered: its chance, and with it its measures, come from its own module.
@@ -19,7 +18,6 @@ from statsmodels.stats.multitest import multipletests
 from pipeline.core.records import (
     ADJECTIVES,
     ALL_SEEDS,
-    CROSS_VALIDATION,
     HEADS,
     NEIGHBOURS,
     RECALL,
@@ -31,13 +29,10 @@ from pipeline.core.records import (
     GradedVision,
     Lora,
     Opd,
-    Optional,
     OutOfFold,
     Part,
-    Record,
     Score,
     ScoreRow,
-    Share,
     Touch,
 )
 from pipeline.evaluation.intervals import Objects, accuracy_interval
@@ -95,7 +90,6 @@ def score_rows(
     graded: Iterable[Graded],
     catalogue: Catalogue,
     classifications: Mapping[int, Sequence[Classification]] | None = None,
-    out_of_fold: Mapping[str, Sequence[OutOfFold]] | None = None,
     vision: Iterable[GradedVision] = (),
     concluded: Mapping[int, Sequence[Score]] | None = None,
     neighbours: Mapping[str, Sequence[OutOfFold]] | None = None,
@@ -106,7 +100,6 @@ def score_rows(
     Args:
         graded: All graded answers of a run; some variants or tasks may be absent.
         classifications: Of the property heads, by seed, those of its folds together; only test and validation count.
-        out_of_fold: By candidate.
         vision: Graded answers of vision-only models.
         concluded: By seed, the scores that `pipeline.evaluation.grading.conclude` gives.
         neighbours: By encoder, the classes of each test video's nearest neighbour.
@@ -145,12 +138,11 @@ def score_rows(
         videos = {seed: _videos(records, Part.TEST) for seed, records in rated.items()}
         runs = {seed: found[p.name] for seed, found in videos.items() if p.name in found}
         rows += _rows(runs, task=RECALL, measure=f"{p.name}: {p.levels[level]}", chance=chances[p.name], **named)
-    # Encoders by cross-validation and by nearest neighbours: only the rows over all repeats.
-    for kind, by_name in ((CROSS_VALIDATION, out_of_fold or {}), (NEIGHBOURS, embeddings)):
-        for name, records in by_name.items():
-            for place, measure in enumerate(chances):
-                predicted = repeats(records, place if place < len(catalogue.properties) else None)
-                rows += _rows(predicted, task=kind, measure=measure, chance=chances[measure], encoder=name)[-1:]
+    # Encoders by nearest neighbours: only the rows over all repeats.
+    for name, records in embeddings.items():
+        for place, measure in enumerate(chances):
+            predicted = repeats(records, place if place < len(catalogue.properties) else None)
+            rows += _rows(predicted, task=NEIGHBOURS, measure=measure, chance=chances[measure], encoder=name)[-1:]
     for name, records in embeddings.items():
         for place, p, level in classes:
             predicted = repeats([r for r in records if r.expected[place] == level], place)
@@ -180,10 +172,7 @@ def effect_rows(
 
 
 def candidate_rows(
-    out_of_fold: Mapping[str, Sequence[OutOfFold]],
-    reference: str,
-    task: str = CROSS_VALIDATION,
-    properties: Sequence[str] = (),
+    neighbours: Mapping[str, Sequence[OutOfFold]], reference: str, properties: Sequence[str]
 ) -> list[EffectRow]:
     """Each other encoder minus the reference: all properties of a video right, then each of `properties` alone.
 
@@ -192,11 +181,11 @@ def candidate_rows(
     """
     rows = []
     for place, measure in [(None, "combined"), *enumerate(properties)]:
-        runs = {name: repeats(records, place) for name, records in out_of_fold.items()}
+        runs = {name: repeats(records, place) for name, records in neighbours.items()}
         for name, videos in runs.items():
             if name != reference and (gap := difference(videos, runs.get(reference, {}))):
                 change = f"{name} - {reference}"
-                rows.append(EffectRow(part="encoder", change=change, task=task, measure=measure, **vars(gap)))
+                rows.append(EffectRow(part="encoder", change=change, task=NEIGHBOURS, measure=measure, **vars(gap)))
     return with_holm(rows)
 
 
@@ -205,37 +194,6 @@ def with_holm(rows: Sequence[EffectRow]) -> list[EffectRow]:
     tested = [row.p for row in rows if row.p is not None]
     adjusted = iter(multipletests(tested, method="holm")[1].tolist() if tested else [])
     return [row if row.p is None else row.model_copy(update={"p_holm": next(adjusted)}) for row in rows]
-
-
-class ErrorRow(Record):
-    """How far one encoder is off in one property, pooled over the repeats of a cross-validation."""
-
-    encoder: str
-    property: str
-    absolute_error: Share
-    """Mean distance of the predicted from the expected class, in classes."""
-    kappa: Optional = None
-    """Quadratically weighted (Cohen 1968): 1 - (mean squared distance) / (the same if both were paired at random); None
-    where all is expected and predicted as one class."""
-    n: int
-    """Videos."""
-
-
-def error_rows(out_of_fold: Mapping[str, Sequence[OutOfFold]], catalogue: Catalogue) -> list[ErrorRow]:
-    """A row for each candidate and property: classes have an order, and one class off is less wrong than two."""
-    from sklearn.metrics import cohen_kappa_score
-
-    rows = []
-    for name, records in out_of_fold.items():
-        for place, prop in enumerate(catalogue.properties):
-            expected, predicted = ([getattr(r, side)[place] for r in records] for side in ("expected", "predicted"))
-            kappa = None
-            if len({*expected, *predicted}) > 1:
-                levels = range(len(prop.levels))
-                kappa = float(cohen_kappa_score(expected, predicted, weights="quadratic", labels=levels))
-            off, n = np.abs(np.subtract(expected, predicted)).mean(), len({r.video_id for r in records})
-            rows.append(ErrorRow(encoder=name, property=prop.name, absolute_error=off, kappa=kappa, n=n))
-    return rows
 
 
 def difference(one: Runs, other: Runs) -> Difference | None:

@@ -16,7 +16,6 @@ from pipeline.config.params import PARAMS_FILE
 from pipeline.core.io import R, read_csv, read_jsonl, read_table, write_csv, write_json, write_text
 from pipeline.core.records import (
     HEADS,
-    NEIGHBOURS,
     TENSOR_FILE,
     Assignment,
     Classification,
@@ -39,7 +38,7 @@ from pipeline.core.records import (
 from pipeline.evaluation.calibration import CalibrationRow, calibrated, calibration_rows
 from pipeline.evaluation.grading import EXTERNAL, conclude, vision_models
 from pipeline.evaluation.neighbours import map_frame, means, nearest_neighbours
-from pipeline.evaluation.scores import ErrorRow, candidate_rows, effect_rows, error_rows, score_rows
+from pipeline.evaluation.scores import candidate_rows, effect_rows, score_rows
 from pipeline.report.figures import draw_figures
 from pipeline.report.load import load_report, published
 from pipeline.report.provenance import provenance
@@ -52,8 +51,6 @@ from pipeline.videos.split import read_splits
 
 MOST_METRICS = 12
 """Columns of `dvc metrics show` that a person still reads."""
-BASELINE = "backbone"
-"""The cross-validated model that all others are compared with in encoder_effects.csv."""
 LOGGED = ("loss", "validation_loss", "validation_combined")
 """Curves that a report keeps; the others are in data/ and in MLflow."""
 
@@ -70,7 +67,7 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
 
     Raises:
         UserError: where videos, split or graded answers are missing, or a file is broken. What a run may lack
-            (an encoder, a cross-validation, curves, samples) is not in its report.
+            (an encoder, curves, samples) is not in its report.
     """
     data, folder = root / "data", root / "reports" / params.report_name
     catalogue = load_catalogue(root / params.data.catalogue)
@@ -79,9 +76,6 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     graded = read_table(data / "graded.parquet", Graded)
     vision = [*_read(data / "graded_vision.parquet", GradedVision), *_read(data / "shipped.parquet", GradedVision)]
     # By the lists in params.yaml, not by the files: after an ablation is narrowed, files of removed variants remain.
-    models = params.cross_validation.models
-    places = {name: data / "cross_validation" / name / "out_of_fold.parquet" for name in models}
-    out_of_fold = {name: found for name, file in places.items() if (found := _read(file, OutOfFold))}
     files = {seed: data / "encoder" / str(seed) / "classifications.parquet" for seed in sorted(params.ablation.seeds)}
     by_encoder = {seed: said for seed, file in files.items() if (said := _read(file, Classification))}
     asked = {seed: read_jsonl(data / "questions" / str(seed) / "evaluation.jsonl", Question) for seed in by_encoder}
@@ -106,13 +100,11 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     sources = vision_models(root / EXTERNAL / params.report_name).values()
     origin["vision"] = [s.model_dump(mode="json") for s in sources if (s.model, s.shown) in rated]
     neighbours, maps = embedded(params, data, catalogue)
-    scores = score_rows(graded, catalogue, pooled, out_of_fold, vision, concluded, neighbours, adjectives)
+    scores = score_rows(graded, catalogue, pooled, vision, concluded, neighbours, adjectives)
     write_csv(folder / "scores.csv", ScoreRow, scores)
     write_csv(folder / "effects.csv", EffectRow, effect_rows(graded, catalogue, concluded))
-    candidates = candidate_rows(out_of_fold, BASELINE)
-    candidates += candidate_rows(neighbours, Encoder.BASE, NEIGHBOURS, catalogue.property_names)
+    candidates = candidate_rows(neighbours, Encoder.BASE, catalogue.property_names)
     write_csv(folder / "encoder_effects.csv", EffectRow, candidates)
-    write_csv(folder / "encoder_errors.csv", ErrorRow, error_rows(out_of_fold, catalogue))
     write_csv(folder / "calibration.csv", CalibrationRow, calibration_rows(list(by_encoder.values())))
     audit = data / "audit" / "audit.csv"
     write_csv(folder / "audit.csv", Finding, read_csv(audit, Finding) if audit.is_file() else [])

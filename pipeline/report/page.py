@@ -32,10 +32,6 @@ SPEED = ("question", "setting", "cost", "unit", "cost_ratio", "error", "error_of
 STABILITY = ("part", "case", "format", "finite", "error", "bound", "verdict")
 AUDIT = ("check", "item", "measured", "expected", "severity")
 BESIDE = {
-    "encoder_errors": (
-        "How far encoders are off",
-        "By how many classes predictions are off on average, and Cohen's quadratically weighted kappa.",
-    ),
     "calibration": (
         "Calibration of the heads' probabilities",
         "Test videos, by the probability of the likeliest class; the row of all has the expected calibration error "

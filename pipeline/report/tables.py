@@ -17,7 +17,6 @@ import yaml
 from pipeline.core.records import (
     ADJECTIVES,
     ALL_SEEDS,
-    CROSS_VALIDATION,
     HEADS,
     NEIGHBOURS,
     RECALL,
@@ -35,7 +34,6 @@ NOT_ANSWERED = {
     HEADS: "Property heads",
     VALIDATION_HEADS: "Property heads, validation videos",
     RECALL: "Property heads, class by class",
-    CROSS_VALIDATION: "Cross-validation",
     NEIGHBOURS: "Nearest neighbour",
     ADJECTIVES: "By adjective",
 }
@@ -231,7 +229,7 @@ def system(row: dict[str, Any]) -> str:
         return others[touch]
     if task in (HEADS, VALIDATION_HEADS, RECALL):
         return "property heads, no language model"
-    if task in (CROSS_VALIDATION, NEIGHBOURS):
+    if task == NEIGHBOURS:
         return str(encoder)
     if not row["lora"]:
         return f"heads and rules, no language model{told}"

@@ -71,7 +71,7 @@ def check_report(report: Path, name: str) -> None:
     chances = {row["measure"]: float(row["chance"]) for row in scores if row["task"] in ("OPD", "heads")}
     expected = dict.fromkeys(("hardness", "roughness", "bumpiness"), 1 / 3) | {name: 1 / 4, "combined": 1 / 108}
     assert chances == pytest.approx(expected, abs=1e-6)
-    assert {"OPD", "heads", "cross_validation"} <= {row["task"] for row in scores if row["measure"] == name}
+    assert {"OPD", "heads"} <= {row["task"] for row in scores if row["measure"] == name}
     videos = {row["video_id"] for row in rows(report, "confusion") if row["property"] == name}
     heads = next(row for row in scores if (row["task"], row["measure"]) == ("heads", name))
     assert len(videos) == float(heads["n"])
@@ -127,7 +127,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     few = ("questions.train={opd:8,pc:24,pss:24,pom:6}", "questions.evaluation={opd:8,pc:24,pss:24,pom:6,psr:4}")
     timm = (
         *("encoder.recipe=tuned", "encoder.backbone=[timm,scenes]", "encoder.weights=data/weights/efficientnet-lite0"),
-        *("pretrain.objects=16", "pretrain.steps=3", "cross_validation.models=[constant]"),
+        *("pretrain.objects=16", "pretrain.steps=3"),
     )
     project.run("octopi", "scale", *REDUCED, *few, *timm, "data.catalogue='my catalogue'", "split.name=mine")
     project.run("dvc", "repro", "questions", "embed")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from statistics import fmean
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from pipeline.core.io import read_csv, write_csv
 from pipeline.core.records import Classification, EffectRow, OutOfFold, Part, ScoreRow
 from pipeline.evaluation.intervals import accuracy_interval
 from pipeline.evaluation.paired import paired
-from pipeline.evaluation.scores import candidate_rows, effect_rows, error_rows, score_rows, with_holm
+from pipeline.evaluation.scores import candidate_rows, effect_rows, score_rows, with_holm
 from pipeline.tasks import TASKS
 from tests.conftest import classified
 from tests.evaluation.conftest import CATALOGUE, PAIRS, graded
@@ -191,10 +190,11 @@ FROZEN = out_of_fold([(RIGHT, HALF, WRONG, RIGHT), (HALF, RIGHT, RIGHT, RIGHT)])
 CONSTANT = out_of_fold([(WRONG, HALF, WRONG, RIGHT), (HALF, HALF, WRONG, RIGHT)])
 
 
-def test_cross_validation_is_the_mean_over_repeats() -> None:
-    rows = score_rows([], CATALOGUE, None, {"backbone": FROZEN})
+def test_nearest_neighbours_are_the_mean_over_repeats() -> None:
+    rows = score_rows([], CATALOGUE, neighbours={"base": FROZEN})
+    rows = [r for r in rows if ":" not in r.measure]
     named = {(r.task, r.encoder, r.lora, r.opd, r.touch, r.seed, r.n) for r in rows}
-    assert named == {("cross_validation", "backbone", "", "", "", "all", 4)}
+    assert named == {("nearest_neighbour", "base", "", "", "", "all", 4)}
     combined = row(rows, measure="combined")
     shares = np.array([0.5, 0.5, 0.5, 1])
     assert (combined.accuracy, combined.right) == (shares.mean(), shares.sum())
@@ -203,7 +203,7 @@ def test_cross_validation_is_the_mean_over_repeats() -> None:
 
 
 def test_encoders_are_compared_video_by_video() -> None:
-    (found,) = candidate_rows({"backbone": FROZEN, "constant": CONSTANT}, "backbone")
+    (found,) = candidate_rows({"backbone": FROZEN, "constant": CONSTANT}, "backbone", ())
     assert (found.part, found.change) == ("encoder", "constant - backbone")
     assert (found.n, found.objects, found.seeds) == (4, 3, 2)
     gains = np.array([[-1, 0, 0, 0], [0, -1, -1, 0]], dtype=float)
@@ -211,28 +211,12 @@ def test_encoders_are_compared_video_by_video() -> None:
     expected = (gap.difference, gap.low, gap.high, gap.p)
     assert (found.difference, found.low, found.high, found.p) == pytest.approx(expected, abs=1e-6)
     assert found.p_holm == found.p
-    assert candidate_rows({"constant": CONSTANT}, "backbone") == []
-    rows = candidate_rows({"backbone": FROZEN, "constant": CONSTANT}, "backbone", "other", CATALOGUE.property_names)
+    assert candidate_rows({"constant": CONSTANT}, "backbone", ()) == []
+    rows = candidate_rows({"backbone": FROZEN, "constant": CONSTANT}, "backbone", CATALOGUE.property_names)
     assert [r.measure for r in rows] == ["combined", *CATALOGUE.property_names]
     assert rows[0].difference == found.difference
     hardness = np.mean([r.expected[0] == r.predicted[0] for r in CONSTANT]) - 7 / 8
     assert rows[1].difference == pytest.approx(hardness, abs=1e-6)
-
-
-def test_errors_know_the_order_of_classes() -> None:
-    """Counts after Cohen 1968 with quadratic weights, by hand; where all is one class there is no kappa."""
-    rows = error_rows({"backbone": FROZEN}, CATALOGUE)
-    assert [(r.property, r.n, r.absolute_error) for r in rows] == [
-        *(("hardness", 4, 2 / 8), ("roughness", 4, 1 / 8), ("bumpiness", 4, 3 / 8))
-    ]
-    table = [[88, 14, 18], [10, 40, 10], [2, 6, 12]]
-    pairs = [(r, c) for r, line in enumerate(table) for c, count in enumerate(line) for _ in range(count)]
-    apart = fmean((r - c) ** 2 for r, c in pairs)
-    by_chance = fmean((r - c) ** 2 for r, _ in pairs for _, c in pairs)
-    said = {"video_id": "a_0", "object_id": "a", "repeat": 0}
-    records = [OutOfFold(expected=(r, 1, 0), predicted=(c, 1, 1), **said) for r, c in pairs]
-    kappas = [r.kappa for r in error_rows({"backbone": records}, CATALOGUE)]
-    assert kappas == [pytest.approx(1 - apart / by_chance, abs=1e-6), None, 0]
 
 
 def test_holm_over_effects_some_of_which_have_no_p() -> None:

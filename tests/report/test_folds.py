@@ -18,7 +18,7 @@ from tests.fake_run import fake_params, write_run
 
 def run(root: Path, seeds: str) -> Path:
     """The folder of a report over these seeds of three folds, without its figures."""
-    few = ("ablation.lora=[with]", "ablation.opd=[all]", "ablation.touch=[]", "cross_validation.models=[backbone]")
+    few = ("ablation.lora=[with]", "ablation.opd=[all]", "ablation.touch=[]")
     params = write_run(root, fake_params("split.name=kfold", "split.folds=3", f"ablation.seeds={seeds}", *few))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pipeline.report.build.draw_figures", lambda *_: [])
