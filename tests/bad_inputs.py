@@ -111,9 +111,7 @@ STAGES = {
     "align.py finetuned all": "2 values instead of 3.*python stages/",
     "lora.py finetuned al 0": "opd is 'al'; allowed: none, needed, all.*python stages/",
     "finetune_encoder.py -1": "seed is '-1'.*python stages/",
-    "cross_validate.py backbone-0": "model is 'backbone-0'; allowed: constant, .*python stages/",
-    "cross_validate.py paperr": "model is 'paperr'; allowed: constant, .*python stages/",
-    **dict.fromkeys(("split.py", "audit.py", "questions.py", "cross_validate.py constant", "grade.py"), NOT_THERE),
+    **dict.fromkeys(("split.py", "audit.py", "questions.py", "grade.py"), NOT_THERE),
     **dict.fromkeys(("finetune_encoder.py 0", "embed.py", "align.py finetuned all 0", "report.py"), NOT_THERE),
     **dict.fromkeys(("lora.py finetuned all 0", "answer.py finetuned with all 0", "package.py"), NOT_THERE),
 }

@@ -164,7 +164,7 @@ def test_any_folder_may_hold_the_videos(name: str, tmp_path: Path) -> None:
         ("smoke language.start=models/nothing", "language.start: models/nothing holds no trained model"),
         ("smoke scenes.objects=[unicorn]", "scenes.objects: unicorn"),
         ("smoke frames.pixels=48", "frames.pixels"),
-        ("smoke cross_validation.models=[paper]", "models.0 is 'paper': .*constant.backbone.backbone-tuned"),
+        ("smoke cross_validation.folds=3", "cross_validation is no section any more; .*split.name=kfold"),
         ("smoke frames.selection=uniform", "frames.selection is 'uniform': Input should be 'salient', 'release' or"),
     ],
 )
@@ -187,7 +187,6 @@ TRAINED = "baseball,pillow,rug,potato,millet"
         (TRAINED, "seed=0", None),
         ("baseball,pillow,millet,bath_towel,ice_block", "seed=0", "2 training objects"),
         ("bath_towel,ice_block", "seed=0", "no video of a training object"),
-        (f"{TRAINED},bath_towel,ice_block", "cross_validation.folds=8", "folds is 8, but only 7 objects"),
     ],
 )
 def test_too_few_objects_are_found_before_any_training(
@@ -228,8 +227,8 @@ def test_variants_are_the_product_of_the_lists() -> None:
 
 def test_prune_keeps_what_params_name_and_removes_the_rest(tmp_path: Path) -> None:
     params = compose("smoke", conf=CONF)
-    kept = {"models/with/base-all-0", "answers/finetuned-with-all-0", "cross_validation/backbone"}
-    for name in (*kept, "models/without/base-all-1", "answers/old", "encoder/3", "cross_validation/old"):
+    kept = {"models/with/base-all-0", "answers/finetuned-with-all-0"}
+    for name in (*kept, "models/without/base-all-1", "answers/old", "encoder/3"):
         (tmp_path / name).mkdir(parents=True)
     (tmp_path / "answers" / ".DS_Store").touch()
     prune(params, tmp_path)

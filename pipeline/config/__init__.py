@@ -29,8 +29,6 @@ Recipe = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]*$")]
 Backend = Literal["processes", "ray"]
 TrainedEmbeddings = Literal["all", "new"]
 Selection = Literal["salient", "release", "contact"]
-COMPARED = r"^(constant|backbone|backbone-tuned)(-[1-9][0-9]*)?$"
-Compared = Annotated[str, Field(pattern=COMPARED)]
 
 INVENTED = Path("data/invented")
 """Where the chain puts the catalogue of invented objects; `data.catalogue` names it to have them."""
@@ -269,20 +267,6 @@ class PretrainConfig(Section):
     seed: Seed = 0
 
 
-class CrossValidationConfig(Section):
-    """Grouped cross-validation of the encoder over all objects with videos."""
-
-    models: tuple[Compared, ...] = Field(default=("constant",), min_length=1)
-    """`constant`: the training objects' most frequent combination of classes. `backbone`: a frame classifier on the
-    frozen `encoder.backbone`, decided jointly. `backbone-tuned`: the same, fine-tuned by `encoder.recipe`. A number
-    behind a name, as in `backbone-10`: learnt from so many objects. Each is a stage."""
-    folds: Annotated[int, Field(ge=2, le=50)] = 5
-    """Parts that objects are dealt into; all videos of an object are in one."""
-    repeats: Positive = 3
-    """How often they are dealt anew."""
-    seed: Seed = 0
-
-
 class LanguageConfig(Section):
     """The language model and its generation."""
 
@@ -466,7 +450,6 @@ class Params(Section):
     questions: QuestionsConfig
     encoder: EncoderConfig
     pretrain: PretrainConfig
-    cross_validation: CrossValidationConfig
     language: LanguageConfig
     align: AlignConfig
     lora: LoraTrainConfig

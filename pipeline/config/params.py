@@ -17,8 +17,11 @@ from pipeline.core.errors import UserError, did_you_mean
 
 PARAMS_FILE, CHAIN, CONF = Path("params.yaml"), Path("dvc.yaml"), Path("conf")
 PACKAGE = Path(__file__).parents[1]
-RENAMED = {"frames.size": "frames.pixels"}
-"""What a parameter was called before, and what it is called now."""
+FORMER = {
+    "frames.size": "is called frames.pixels now; write that name",
+    "cross_validation": "is no section any more; remove it: the folds of split.name=kfold test every object once",
+}
+"""Parameters of earlier versions, and what took their place."""
 QUOTED = r"""'.*'|".*\""""
 
 
@@ -150,8 +153,8 @@ def validate(values: Mapping[str, Any], origin: str) -> Params:
     except ValidationError as error:
         detail = error.errors(include_url=False)[0]
     key, kind, message = ".".join(map(str, detail["loc"])), detail["type"], detail["msg"].removeprefix("Value error, ")
-    if key in RENAMED:
-        line = f"{key} is called {RENAMED[key]} now; write that name"
+    if key in FORMER:
+        line = f"{key} {FORMER[key]}"
     elif kind == "extra_forbidden":
         known = list(getattr(kind_of(detail["loc"][:-1]), "model_fields", ()))
         hint = did_you_mean(str(detail["loc"][-1]), known)

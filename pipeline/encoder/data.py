@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch.nn import functional as F
 from torch.utils.data import DataLoader
@@ -15,7 +14,7 @@ from torch.utils.data import DataLoader
 from pipeline.core.errors import UserError
 from pipeline.core.records import Assignment, Classification, Flip, Part
 from pipeline.core.runtime import derive_seed
-from pipeline.encoder.model import FrameEncoder, PropertyClassifier
+from pipeline.encoder.model import PropertyClassifier
 from pipeline.training.sampling import EpochDataset, sample_evaluation, sample_training
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
@@ -93,24 +92,6 @@ class EncoderData:
     def classes(self) -> list[int]:
         """Number of classes of each property."""
         return [len(p.levels) for p in self.catalogue.properties]
-
-
-@torch.inference_mode()
-def describe_clips(
-    encoder: FrameEncoder, data: EncoderData, videos: Sequence[LabelledVideo], batch_size: int, device: torch.device
-) -> npt.NDArray[np.float32]:
-    """Features of the frames of each video's evaluation clip: float32, videos x frames x features."""
-    encoder = encoder.to(device).eval()
-    clips = ClipDataset(data.store, videos, per_video=data.per_video)
-    features = []
-    # `batch_size` counts frames, a loader clips.
-    for batch in DataLoader(clips, batch_size=max(1, batch_size // data.per_video)):
-        frames, frame_indices = batch["frames"].to(device), batch["frame_indices"].to(device)
-        described = encoder.describe(frames.flatten(0, 1), frame_indices.flatten())
-        features.append(described.view(*frames.shape[:2], -1).float().cpu())
-    found = torch.cat(features)
-    check_finite(found.flatten(1), videos)
-    return found.numpy()
 
 
 @torch.inference_mode()

@@ -53,16 +53,12 @@ class Training:
     """Further callbacks for its Trainer, such as tracking."""
 
 
-def finetune(training: Training, trunks: Trunks | None = None) -> tuple[PropertyClassifier, list[Measurement]]:
+def finetune(training: Training) -> tuple[PropertyClassifier, list[Measurement]]:
     """Train the recipe's classifier; return it with its training curve.
 
     `tuned` fits the heads, then tunes them and what is unfrozen of the encoder. The fitted heads count as epoch 0, and
     the best epoch is kept (ties: the first). Without validation videos the heads are kept as they were fitted, since
     nothing could show that tuning helps.
-
-    Args:
-        trunks: For the recipe `tuned`, outputs of the frozen layers that were computed for these videos before, with
-            all flips where `encoder.flip_probability` is above 0.
     """
     data, config, device = training.data, training.config, resolve_device(training.runtime.device)
     seed_everything(training.seed)
@@ -71,9 +67,8 @@ def finetune(training: Training, trunks: Trunks | None = None) -> tuple[Property
         return model, train_classifier(model, training)
     encoder, chosen = model.encoder, data.videos(Part.VALIDATION)
     assert isinstance(encoder, SideBySide)
-    if trunks is None:
-        videos, mirrored = [*data.videos(Part.TRAIN), *chosen], config.flip_probability > 0
-        trunks = run_trunks(encoder, data, videos, device, mirrored=mirrored)
+    videos, mirrored = [*data.videos(Part.TRAIN), *chosen], config.flip_probability > 0
+    trunks = run_trunks(encoder, data, videos, device, mirrored=mirrored)
     model.to(device)
 
     @torch.inference_mode()

@@ -180,7 +180,7 @@ def log_dependence(labels: Labels, objects: Sequence[str], classes: Sequence[int
     if (number := math.prod(classes)) > MOST_COMBINATIONS:
         raise UserError(
             f"{number} combinations of classes are too many to decide jointly ({MOST_COMBINATIONS} at most); name "
-            "fewer properties in properties.yaml, or set encoder.recipe=paper and cross_validation.models=[constant]"
+            "fewer properties in properties.yaml, or set encoder.recipe=paper"
         )
     joint = np.full(tuple(classes), SMOOTHING)
     for row in dict(zip(objects, map(tuple, labels.tolist()), strict=True)).values():

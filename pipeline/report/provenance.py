@@ -34,7 +34,7 @@ ARCHITECTURES = {
     "tf_efficientnet_lite0": "EfficientNet-Lite0",
 }
 UNTOLD = {
-    *("scale", "seed", "kernels", "data", "invent", "scenes", "split", "cross_validation", "ablation", "shipped"),
+    *("scale", "seed", "kernels", "data", "invent", "scenes", "split", "ablation", "shipped"),
     *("packaged", "tracking", "runtime", "weights", "evaluation"),
     *("micro_batch_size", "embed_batch_size", "generation_batch_size"),
 }

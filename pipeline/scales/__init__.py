@@ -90,11 +90,6 @@ def check_objects(params: Params, catalogue: Catalogue) -> str:
                 f"ablation.touch: swapped gives a test object the touch of another, but with {where} only {tested[0]} "
                 "has videos; leave swapped out, or add test objects"
             )
-    if len(present) < params.cross_validation.folds:
-        raise UserError(
-            f"cross_validation.folds is {params.cross_validation.folds}, but only {len(present)} objects have videos; "
-            "lower it"
-        )
     return lacking
 
 
@@ -137,7 +132,6 @@ def prune(params: Params, data: Path) -> None:
     variants, ablation = params.ablation.variants(), params.ablation
     trained = {f"{v.encoder}-{v.opd}-{v.seed}" for v in variants}
     keep: dict[str, set[str]] = {
-        "cross_validation": set(params.cross_validation.models),
         "encoder": {str(seed) for seed in ablation.seeds},
         "models/without": trained,
         "models/with": trained,

@@ -49,7 +49,7 @@ UTILISATION = 0.35
 2022, table 3); small batches reach less."""
 USUAL_FRAMES = 112
 """Frames of a video, which is not opened to count them: the paper's average."""
-REST = ("pretrain", "cross_validate", "finetune_encoder", "embed")
+REST = ("pretrain", "finetune_encoder", "embed")
 """Stages that run a model and may not be counted: for want of shapes, videos, or a formula."""
 
 

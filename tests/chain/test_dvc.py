@@ -128,7 +128,7 @@ def test_a_split_without_a_test_object_is_one_warning(tmp_path: Path, caplog: py
     """DVC warns of every empty file at every stage that depends on it, and there are eight that answer."""
     project = copy_project(tmp_path / "untested")
     learnt = ",".join(o for o in OBJECTS if o not in ("bath_towel", "ice_block", "toilet_brush_bristles"))
-    project.run("octopi", "scale", *REDUCED, f"scenes.objects=[{learnt}]", "cross_validation.folds=2")
+    project.run("octopi", "scale", *REDUCED, f"scenes.objects=[{learnt}]")
     said = [line for line in project.run("dvc", "repro", "questions").splitlines() if "WARNING" in line]
     with Repo(str(project.folder)) as repo:
         for stage in (stage for stage in repo.index.stages if stage.name.startswith("answer@")):
@@ -149,7 +149,6 @@ NONE = {
     "data.dir": "stands in the paths of dependencies",
     **dict.fromkeys(("tracking.uri", "tracking.experiment", "tracking.live", "tracking.timeout_seconds"), "only shows"),
     "packaged": "which variants are copied",
-    "cross_validation.models": "the stages themselves",
     "runtime.parallel": "every backend gives the same bytes",
     "runtime.save_steps": "a resumed training ends as one that was not",
     # Sums are added in another order, as on another processor; dvc.lock is to hold on the next machine.
@@ -177,5 +176,5 @@ def test_a_command_is_the_same_whatever_the_parameters() -> None:
 
 def test_what_changes_answers_is_a_parameter_of_what_answers() -> None:
     keys = {"answer": "language.generation_batch_size", "finetune_encoder": "encoder.max_grad_norm"}
-    keys |= dict.fromkeys(("embed", "cross_validate"), "encoder.embed_batch_size")
+    keys |= {"embed": "encoder.embed_batch_size"}
     assert {name for name, key in keys.items() if key not in stages()[name]["params"]} == set()

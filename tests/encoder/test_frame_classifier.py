@@ -20,6 +20,7 @@ from pipeline.core.records import Part
 from pipeline.encoder import frame_classifier
 from pipeline.encoder.data import EncoderData
 from pipeline.encoder.finetune import finetune
+from pipeline.encoder.folds import deal
 from pipeline.encoder.frame_classifier import STRENGTHS, JointFrameClassifier, choose_strength, fit_frame_heads
 from pipeline.encoder.model import FrameEncoder
 from pipeline.videos.catalogue import Catalogue
@@ -212,3 +213,13 @@ def test_joint_decoding_against_brute_force(seed: int, classes: list[int]) -> No
 def test_too_many_combinations_are_one_line() -> None:
     with refused("^1000000 combinations of classes are too many to decide"):
         frame_classifier.log_dependence(np.zeros((1, 2), np.int64), ["a"], (1000, 1000))
+
+
+@given(st.lists(st.integers(0, 30), min_size=2, max_size=80), st.integers(2, 7), st.integers(0, 99))
+def test_folds_hold_whole_objects_and_are_even(numbers: list[int], folds: int, seed: int) -> None:
+    objects = [f"o{n}" for n in numbers]
+    folds = min(folds, len(set(objects)))
+    dealt = deal(objects, folds, seed)
+    assert sorted(itertools.chain.from_iterable(dealt)) == sorted(set(objects))
+    assert max(map(len, dealt)) - min(map(len, dealt)) <= 1
+    assert dealt == deal(objects[::-1], folds, seed)
