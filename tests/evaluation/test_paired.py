@@ -15,7 +15,7 @@ from scipy import stats
 from scipy.integrate import quad
 
 from pipeline.evaluation.intervals import design_of
-from pipeline.evaluation.paired import DRAWS, flip_units, paired, sign_flip, smallest_effect, standard_error
+from pipeline.evaluation.paired import FLIPS, flip_units, paired, sign_flip, smallest_effect, standard_error
 from tests.evaluation.conftest import About, designs, single
 
 GAINS = st.lists(st.integers(-1, 1), min_size=24, max_size=24)
@@ -74,11 +74,11 @@ def test_properties(about: About, gains: list[int], more: list[int], seed: int) 
 def test_sign_flip_of_darwins_maize() -> None:
     """Fisher 1935, section 21: of 32768 ways to sign the 15 differences, 1726 are as far from 0."""
     differences = np.array([49, -67, 8, 16, 6, 23, 28, 41, 14, 29, 56, 24, 75, 60, -48], dtype=float)
-    assert float(sign_flip(differences, design_of(single(15, 1)))) == 1726 / 32768
+    assert sign_flip(differences, design_of(single(15, 1))) == 1726 / 32768
     # A sixteenth object that brings nothing changes no sum, but there are too many now to go through.
-    drawn = float(sign_flip(np.append(differences, 0.0), design_of(single(16, 1))))
+    drawn = sign_flip(np.append(differences, 0.0), design_of(single(16, 1)))
     assert drawn == pytest.approx(1726 / 32768, abs=0.007)
-    assert float(sign_flip(np.ones(40), design_of(single(40, 1)))) == 1 / (DRAWS + 1)
+    assert sign_flip(np.ones(40), design_of(single(40, 1))) == 1 / (FLIPS + 1)
 
 
 def test_pairs_are_split_by_least_squares_and_all_signs_gone_through() -> None:
@@ -89,15 +89,15 @@ def test_pairs_are_split_by_least_squares_and_all_signs_gone_through() -> None:
     parts = np.linalg.lstsq(shares, values, rcond=None)[0] * shares.sum(axis=0)
     assert parts.sum() == pytest.approx(values.sum())
     far = [abs(float(np.dot(signs, parts))) >= abs(values.sum()) - 1e-9 for signs in signs_of(5)]
-    assert float(sign_flip(values, design_of(about))) == pytest.approx(fmean(far), abs=1e-12)
+    assert sign_flip(values, design_of(about)) == pytest.approx(fmean(far), abs=1e-12)
 
 
 def test_what_questions_cannot_tell_apart_is_flipped_together() -> None:
     pairs = design_of((("a", "b"), ("c", "d"), ("c", "d"), ("e", "f")))
     assert flip_units(pairs).tolist() == [[1, 0, 0, 0], [0, 1, 1, 0], [0, 0, 0, 1]]
-    assert float(sign_flip(np.ones(4), pairs)) == 2 / 8
+    assert sign_flip(np.ones(4), pairs) == 2 / 8
     chain = design_of((("a", "b"), ("b", "c"), ("c", "d")))
-    assert float(sign_flip(np.ones(3), chain)) == 1, "one part has one sign"
+    assert sign_flip(np.ones(3), chain) == 1, "one part has one sign"
 
 
 def test_several_seeds_are_one_comparison_of_their_means() -> None:
