@@ -350,17 +350,6 @@ class Classification(Record):
     probabilities: tuple[float, ...]
 
 
-class OutOfFold(Record):
-    """What a model said of one video in one repeat of a cross-validation, without having seen the video's object."""
-
-    video_id: str
-    object_id: str
-    repeat: int = Field(ge=0)
-    expected: tuple[int, ...]
-    """A class for each property, in the catalogue's order."""
-    predicted: tuple[int, ...]
-
-
 class Measurement(Record):
     """One logged value of a training: a point of a curve."""
 
@@ -391,16 +380,12 @@ TENSOR_FILE, INDEX_FILE = "embeddings.safetensors", "index.parquet"
 
 
 ALL_SEEDS = "all"
-"""In place of a seed: the mean over seeds, or over the repeats of a cross-validation."""
+"""In place of a seed: the mean over seeds."""
 # Values of the column `task` in rows that are no task's own accuracy.
 HEADS, VALIDATION_HEADS = "heads", "heads_validation"
 """The fine-tuned encoder's property heads on test and on validation videos."""
 RECALL = "heads_recall"
 """Of each class's test videos, the share that the heads put into it."""
-NEIGHBOURS = "nearest_neighbour"
-"""The class of each test video's nearest neighbour."""
-ADJECTIVES = "adjective"
-"""A task's answers, counted again by adjective."""
 
 
 class ScoreRow(Record):
@@ -409,7 +394,7 @@ class ScoreRow(Record):
     task: str
     measure: str
     encoder: str
-    """In a cross-validation the candidate's name, for a vision-only model the model's."""
+    """For a vision-only model the model's name."""
     lora: str = ""
     opd: str = ""
     touch: str = ""

@@ -1,4 +1,4 @@
-"""Calibration of the property heads' probabilities: temperature scaling, reliability, expected calibration error.
+"""Calibration of the property heads' probabilities: temperature scaling and the expected calibration error.
 
 Guo et al. 2017, "On Calibration of Modern Neural Networks" (arXiv 1706.04599).
 """
@@ -11,40 +11,30 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
-import pandas as pd
 
-from pipeline.core.records import Classification, Optional, Part, Record, Share
-from pipeline.core.runtime import derive_seed
+from pipeline.core.records import Classification, Part, Record, Share
 
 Floats = npt.NDArray[np.float64]
 
 BINS = 10
+"""Bins of equal width by the likeliest class's probability; a border belongs to the bin below it."""
 RANGE = (0.05, 20.0)
 """Temperatures to search: beyond them probabilities are all but one-hot, or uniform."""
 PRIOR = 2.0
 """Standard deviation of the prior on the temperature, as a factor."""
 SMALLEST = 1e-12
 """Lower bound of a probability before its logarithm is taken."""
-DRAWS = 1000
-"""Bootstrap samples."""
 
 
 class CalibrationRow(Record):
-    """Calibration of one property's probabilities: of all answers, or of those in one bin of confidence."""
+    """Calibration of one property's probabilities."""
 
     property: str
-    probability: str
-    """The bin of the likeliest class's probability, or "all"."""
     n: int
-    mean_probability: Share
-    right: Share
-    """Share of answers whose likeliest class is the rated one."""
     error: Share
-    """|right - mean probability| of a bin; of all, the expected calibration error."""
-    low: Optional = None
-    high: Optional = None
-    without_temperature: Optional = None
-    """The expected calibration error of the probabilities as the heads give them."""
+    """Expected calibration error."""
+    without_temperature: Share
+    """The error of the probabilities as the heads give them."""
 
 
 def rescale(probabilities: npt.ArrayLike, temperature: float) -> Floats:
@@ -82,27 +72,6 @@ def fit_temperature(classified: Sequence[Classification]) -> float:
     return float(np.exp(found.x))
 
 
-def _binned(classified: Sequence[Classification]) -> pd.DataFrame:
-    """A row an answer: its object, the probability of the likeliest class, whether that is the rated one, its bin."""
-    probabilities = np.array([c.probabilities for c in classified])
-    right = probabilities.argmax(axis=1) == [c.expected for c in classified]
-    table = pd.DataFrame({"mean_probability": probabilities.max(axis=1), "right": right.astype(float)})
-    # A border belongs to the bin below it.
-    bins = np.clip(np.ceil(table["mean_probability"] * BINS).astype(int) - 1, 0, BINS - 1)
-    return table.assign(bin=bins, object_id=[c.object_id for c in classified])
-
-
-def reliability(classified: Sequence[Classification]) -> pd.DataFrame:
-    """Answers of like confidence: `BINS` bins of equal width, by number from 0, of which empty ones are left out.
-
-    Returns:
-        Columns `n`, `mean_probability` of the likeliest class, and `right`, the share where it is the rated one.
-    """
-    table = _binned(classified)
-    bins = table.groupby("bin")[["mean_probability", "right"]].mean()
-    return bins.assign(n=table["bin"].value_counts())
-
-
 def calibrated(classified: Sequence[Classification]) -> Iterator[tuple[Classification, Classification]]:
     """One encoder's classifications of test videos, before and after scaling by a temperature that is fitted to its
     validation videos, property by property."""
@@ -115,45 +84,20 @@ def calibrated(classified: Sequence[Classification]) -> Iterator[tuple[Classific
 
 
 def calibration_rows(encoders: Sequence[Sequence[Classification]]) -> list[CalibrationRow]:
-    """Test videos of all encoders together, by property: a row for all of them, then one a bin.
-
-    `encoders` holds the classifications of validation and test videos by each.
-    """
+    """By property, test videos of all encoders together; `encoders` holds validation and test videos of each."""
     pairs = [pair for classified in encoders for pair in calibrated(classified)]
     rows = []
     for name in dict.fromkeys(before.property for before, _ in pairs):
         given, answers = zip(*(pair for pair in pairs if pair[0].property == name), strict=True)
-        bins = reliability(answers)
-        low, high = error_interval(answers)
-        whole = {column: np.average(bins[column], weights=bins["n"]) for column in ("mean_probability", "right")}
-        whole |= {"n": len(answers), "error": calibration_error(answers), "low": low, "high": high}
-        whole |= {"without_temperature": calibration_error(given)}
-        rows.append(CalibrationRow(property=name, probability="all", **whole))
-        for place, b in bins.iterrows():
-            words = f"{place / BINS:.1f} to {(place + 1) / BINS:.1f}"
-            error = abs(b["right"] - b["mean_probability"])
-            rows.append(CalibrationRow(property=name, probability=words, error=error, **b))
+        errors = {"error": calibration_error(answers), "without_temperature": calibration_error(given)}
+        rows.append(CalibrationRow(property=name, n=len(answers), **errors))
     return rows
 
 
 def calibration_error(classified: Sequence[Classification]) -> float:
-    """Expected calibration error: |right - mean probability| averaged over bins, weighted by their answers."""
-    bins = reliability(classified)
-    return float((bins["n"] * (bins["right"] - bins["mean_probability"])).abs().sum()) / len(classified)
-
-
-def error_interval(classified: Sequence[Classification]) -> tuple[float, float]:
-    """95 % interval of the calibration error, by a percentile bootstrap over objects.
-
-    With few answers error and interval are biased upwards: chance alone separates accuracy from confidence.
-    """
-    table = _binned(classified)
-    objects = table["object_id"].unique()
-    # By object and bin, the right answers minus the sum of their probabilities; these add up over the objects drawn.
-    excess = (table["right"] - table["mean_probability"]).groupby([table["object_id"], table["bin"]]).sum()
-    gaps = excess.unstack(fill_value=0.0).reindex(objects).to_numpy()
-    sizes = table["object_id"].value_counts().reindex(objects).to_numpy()
-    drawn = np.random.default_rng(derive_seed("calibration")).integers(len(sizes), size=(DRAWS, len(sizes)))
-    errors = np.abs(gaps[drawn].sum(axis=1)).sum(axis=1) / sizes[drawn].sum(axis=1)
-    low, high = np.quantile(errors, [0.025, 0.975]).tolist()
-    return low, high
+    """Expected calibration error: |share right - mean probability of the likeliest class| averaged over bins, weighted
+    by their answers. Of few answers it is biased upwards: chance alone separates accuracy from confidence."""
+    probabilities = np.array([c.probabilities for c in classified])
+    likeliest, right = probabilities.max(axis=1), probabilities.argmax(axis=1) == [c.expected for c in classified]
+    excess = np.bincount(np.ceil(likeliest * BINS).astype(int), right - likeliest)
+    return float(np.abs(excess).sum()) / len(classified)

@@ -1,4 +1,4 @@
-"""Embeddings without a trained head: nearest neighbours among videos of other objects, and two-dimensional maps."""
+"""Embeddings without a trained head: two-dimensional maps of videos."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from pipeline.core.io import read_table
-from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Assignment, Embedding, OutOfFold
+from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Assignment, Embedding
 from pipeline.videos.catalogue import Catalogue
 
 MAPPED = 400
@@ -29,32 +29,6 @@ def means(folder: Path, videos: Sequence[Assignment]) -> NDArray[np.float64]:
         if entry.flip == "none":
             rows[entry.video_id].append(entry.row)
     return np.stack([tensor[rows[v.video_id]].mean(0, dtype=np.float64) for v in videos])
-
-
-def nearest_neighbours(
-    features: NDArray[np.float64], videos: Sequence[Assignment], catalogue: Catalogue, repeat: int
-) -> list[OutOfFold]:
-    """For each video, the classes of the one nearest to it (Euclidean) among those of other objects.
-
-    Empty where all videos are of one object.
-    """
-    from scipy.spatial.distance import cdist
-
-    objects = np.array([v.object_id for v in videos])
-    if len(set(objects)) < 2:
-        return []
-    apart = cdist(features, features)
-    apart[objects[:, None] == objects[None]] = np.inf
-    return [
-        OutOfFold(
-            video_id=video.video_id,
-            object_id=video.object_id,
-            repeat=repeat,
-            expected=catalogue.labels(video.object_id),
-            predicted=catalogue.labels(str(objects[place])),
-        )
-        for video, place in zip(videos, apart.argmin(1), strict=True)
-    ]
 
 
 def map_frame(features: NDArray[np.float64], videos: Sequence[Assignment], catalogue: Catalogue) -> pd.DataFrame:

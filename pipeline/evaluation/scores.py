@@ -7,8 +7,8 @@ here by itself once it is registered: its chance, and with it its measures, come
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
-from itertools import groupby
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from statistics import fmean
 from typing import NamedTuple
 
@@ -16,10 +16,8 @@ import numpy as np
 from statsmodels.stats.multitest import multipletests
 
 from pipeline.core.records import (
-    ADJECTIVES,
     ALL_SEEDS,
     HEADS,
-    NEIGHBOURS,
     RECALL,
     VALIDATION_HEADS,
     Classification,
@@ -29,7 +27,6 @@ from pipeline.core.records import (
     GradedVision,
     Lora,
     Opd,
-    OutOfFold,
     Part,
     Score,
     ScoreRow,
@@ -42,18 +39,19 @@ from pipeline.videos.catalogue import Catalogue
 
 
 class Setting(NamedTuple):
-    """Who answered, and from what touch, apart from the seed."""
+    """Who answered, and from what touch, apart from the seed; "" for what does not apply."""
 
-    encoder: Encoder
-    lora: Lora | None
-    """None where no language model answered."""
-    opd: Opd | None
-    touch: Touch
+    encoder: str
+    """For a vision-only model, the model."""
+    lora: str = ""
+    opd: str = ""
+    touch: str = Touch.REAL
+    """For a vision-only model, what it was shown in place of touch."""
 
 
-FULL = Setting(Encoder.FINETUNED, Lora.WITH, Opd.ALL, Touch.REAL)
-RULES = Setting(Encoder.FINETUNED, None, None, Touch.REAL)
-"""No language model: answers follow by rule from the classes that the property heads predict."""
+FULL = Setting(Encoder.FINETUNED, Lora.WITH, Opd.ALL)
+RULES = Setting(Encoder.FINETUNED)
+"""No language model: the property heads, or answers that follow by rule from the classes that they predict."""
 CHANGES: tuple[tuple[str, Setting, Setting], ...] = (
     ("language", FULL, RULES),
     ("encoder", FULL, FULL._replace(encoder=Encoder.BASE)),
@@ -82,6 +80,8 @@ class Answer(NamedTuple):
 
 Runs = Mapping[int, Mapping[str, Answer]]
 """By seed and question."""
+Entry = tuple[str, str, Setting, int, str, Answer]
+"""Task, measure, setting, seed, question and its answer."""
 Table = Mapping[tuple[str, str], Mapping[Setting, Runs]]
 """By task and measure, then setting, seed and question."""
 
@@ -92,8 +92,6 @@ def score_rows(
     classifications: Mapping[int, Sequence[Classification]] | None = None,
     vision: Iterable[GradedVision] = (),
     concluded: Mapping[int, Sequence[Score]] | None = None,
-    neighbours: Mapping[str, Sequence[OutOfFold]] | None = None,
-    adjectives: Mapping[str, str] | None = None,
 ) -> list[ScoreRow]:
     """The rows of scores.csv: one a seed and one over all of them, for each measure and setting that has answers.
 
@@ -102,52 +100,18 @@ def score_rows(
         classifications: Of the property heads, by seed, those of its folds together; only test and validation count.
         vision: Graded answers of vision-only models.
         concluded: By seed, the scores that `pipeline.evaluation.grading.conclude` gives.
-        neighbours: By encoder, the classes of each test video's nearest neighbour.
-        adjectives: By question, the adjective that it asks by.
     """
-    rows: list[ScoreRow] = []
-    words, heads, embeddings = adjectives or {}, classifications or {}, neighbours or {}
-    # Answers of the language model, and those that follow by rule; of both also each adjective's own.
-    for (task, measure), settings in _table(graded, catalogue, concluded or {}).items():
-        chance = TASKS[task].chance(catalogue)[measure]
-        for setting, runs in settings.items():
-            named = {axis: value for axis, value in setting._asdict().items() if value is not None}
-            rows += _rows(runs, task=task, measure=measure, chance=chance, **named)
-            for word in dict.fromkeys(words.values()) if setting in (FULL, RULES) else ():
-                own = {seed: {q: a for q, a in found.items() if words.get(q) == word} for seed, found in runs.items()}
-                if all(own.values()):
-                    rows += _rows(own, task=ADJECTIVES, measure=f"{task}: {word}", chance=chance, **named)[-1:]
-    # Vision-only models.
-    by_model: dict[tuple[str, ...], dict[int, dict[str, Answer]]] = defaultdict(lambda: defaultdict(dict))
-    for g in vision:
-        by_model[g.task, g.measure, g.model, g.shown][g.seed][g.question_id] = Answer.of(g)
-    for (task, measure, model, shown), runs in by_model.items():
-        chance = TASKS[task].chance(catalogue)[measure]
-        rows += _rows(runs, task=task, measure=measure, chance=chance, encoder=model, opd=Opd.ALL, touch=shown)
-    # The property heads, whose chance is that of a description; then the recall of each class.
-    chances = TASKS["OPD"].chance(catalogue)
-    classes = [(place, p, level) for place, p in enumerate(catalogue.properties) for level in range(len(p.levels))]
-    named = {"encoder": Encoder.FINETUNED, "touch": Touch.REAL}
-    for kind, part in ((HEADS, Part.TEST), (VALIDATION_HEADS, Part.VALIDATION)):
-        videos = {seed: _videos(records, part) for seed, records in heads.items()}
-        for measure, chance in chances.items():
-            runs = {seed: found[measure] for seed, found in videos.items() if measure in found}
-            rows += _rows(runs, task=kind, measure=measure, chance=chance, **named)
-    for _, p, level in classes:
-        rated = {seed: [c for c in records if c.expected == level] for seed, records in heads.items()}
-        videos = {seed: _videos(records, Part.TEST) for seed, records in rated.items()}
-        runs = {seed: found[p.name] for seed, found in videos.items() if p.name in found}
-        rows += _rows(runs, task=RECALL, measure=f"{p.name}: {p.levels[level]}", chance=chances[p.name], **named)
-    # Encoders by nearest neighbours: only the rows over all repeats.
-    for name, records in embeddings.items():
-        for place, measure in enumerate(chances):
-            predicted = repeats(records, place if place < len(catalogue.properties) else None)
-            rows += _rows(predicted, task=NEIGHBOURS, measure=measure, chance=chances[measure], encoder=name)[-1:]
-    for name, records in embeddings.items():
-        for place, p, level in classes:
-            predicted = repeats([r for r in records if r.expected[place] == level], place)
-            measure = f"{p.name}: {p.levels[level]}"
-            rows += _rows(predicted, task=NEIGHBOURS, measure=measure, chance=chances[p.name], encoder=name)[-1:]
+    seen = _tabled(
+        (g.task, g.measure, Setting(g.model, opd=Opd.ALL, touch=g.shown), g.seed, g.question_id, Answer.of(g))
+        for g in vision
+    )
+    chances, rows = {name: task.chance(catalogue) for name, task in TASKS.items()}, []
+    for table in (_answers(graded, catalogue, concluded or {}), seen, _heads(classifications or {}, catalogue)):
+        for (task, measure), settings in table.items():
+            # The heads' chance is that of a description.
+            chance = chances.get(task, chances["OPD"])[measure.partition(":")[0]]
+            for setting, runs in settings.items():
+                rows += _rows(runs, task=task, measure=measure, chance=chance, **setting._asdict())
     return rows
 
 
@@ -160,7 +124,7 @@ def effect_rows(
     over all rows. Arguments are as `score_rows` takes them.
     """
     rows = []
-    table = _table(graded, catalogue, concluded or {})
+    table = _answers(graded, catalogue, concluded or {})
     for part, full, less in CHANGES:
         for (task, measure), settings in table.items():
             if measure == TASKS[task].measure and (gap := difference(settings.get(full, {}), settings.get(less, {}))):
@@ -168,24 +132,6 @@ def effect_rows(
                 if less is not RULES:
                     change = f"{getattr(full, part)} - {getattr(less, part)}"
                 rows.append(EffectRow(part=part, change=change, task=task, measure=measure, **vars(gap)))
-    return with_holm(rows)
-
-
-def candidate_rows(
-    neighbours: Mapping[str, Sequence[OutOfFold]], reference: str, properties: Sequence[str]
-) -> list[EffectRow]:
-    """Each other encoder minus the reference: all properties of a video right, then each of `properties` alone.
-
-    Computed as effects are, with repeats in place of seeds and a Holm adjustment of its own. Empty where the reference
-    was not run.
-    """
-    rows = []
-    for place, measure in [(None, "combined"), *enumerate(properties)]:
-        runs = {name: repeats(records, place) for name, records in neighbours.items()}
-        for name, videos in runs.items():
-            if name != reference and (gap := difference(videos, runs.get(reference, {}))):
-                change = f"{name} - {reference}"
-                rows.append(EffectRow(part="encoder", change=change, task=NEIGHBOURS, measure=measure, **vars(gap)))
     return with_holm(rows)
 
 
@@ -204,15 +150,6 @@ def difference(one: Runs, other: Runs) -> Difference | None:
         return None
     gains = [[float(one[s][q].correct) - float(other[s][q].correct) for q in asked] for s in seeds]
     return paired(np.array(gains), [one[seeds[0]][q].objects for q in asked])
-
-
-def repeats(records: Iterable[OutOfFold], place: int | None = None) -> dict[int, dict[str, Answer]]:
-    """Whether one property, or with None every property, was predicted right; by repeat and video."""
-    part = slice(None) if place is None else slice(place, place + 1)
-    runs: dict[int, dict[str, Answer]] = defaultdict(dict)
-    for r in records:
-        runs[r.repeat][r.video_id] = Answer(r.expected[part] == r.predicted[part], (r.object_id,))
-    return runs
 
 
 def _rows(runs: Runs, **named: object) -> list[ScoreRow]:
@@ -245,36 +182,54 @@ def _row(questions: Sequence[Sequence[Answer]], **named: object) -> ScoreRow:
     )
 
 
-def grouped(graded: Iterable[Graded]) -> dict[tuple[str, str], dict[Setting, dict[int, dict[str, Answer]]]]:
+def grouped(graded: Iterable[Graded]) -> Table:
     """Answers by task and measure, then by setting."""
+    return _tabled(_entries(graded))
+
+
+def _entries(graded: Iterable[Graded]) -> Iterator[Entry]:
+    for g in graded:
+        yield g.task, g.measure, Setting(g.encoder, g.lora, g.opd, g.touch), g.seed, g.question_id, Answer.of(g)
+
+
+def _tabled(entries: Iterable[Entry], order: Iterable[tuple[str, str]] = ()) -> Table:
+    """A table of these answers; with an order, of these tasks and measures alone."""
     found: dict[tuple[str, str], dict[Setting, dict[int, dict[str, Answer]]]] = defaultdict(
         lambda: defaultdict(lambda: defaultdict(dict))
     )
-    for g in graded:
-        found[g.task, g.measure][Setting(g.encoder, g.lora, g.opd, g.touch)][g.seed][g.question_id] = Answer.of(g)
-    return found
+    for task, measure, setting, seed, question, answer in entries:
+        found[task, measure][setting][seed][question] = answer
+    return {key: found[key] for key in order or found if key in found}
 
 
-def _table(graded: Iterable[Graded], catalogue: Catalogue, concluded: Mapping[int, Sequence[Score]]) -> Table:
+def _answers(graded: Iterable[Graded], catalogue: Catalogue, concluded: Mapping[int, Sequence[Score]]) -> Table:
     """In the order of the registered tasks and of what each calls its measures."""
-    found = grouped(graded)
-    for seed, scores in concluded.items():
-        for s in scores:
-            found[s.task, s.measure][RULES][seed][s.question_id] = Answer.of(s)
-    keys = [(task, measure) for task, definition in TASKS.items() for measure in definition.chance(catalogue)]
-    return {key: found[key] for key in keys if key in found}
+    ruled = (
+        (s.task, s.measure, RULES, seed, s.question_id, Answer.of(s))
+        for seed, scores in concluded.items()
+        for s in scores
+    )
+    order = [(task, measure) for task, definition in TASKS.items() for measure in definition.chance(catalogue)]
+    return _tabled(chain(_entries(graded), ruled), order)
 
 
-def _videos(records: Iterable[Classification], part: Part) -> dict[str, dict[str, Answer]]:
-    """By property and `combined`, whether the heads were right about each video of a part."""
-    found: dict[str, dict[str, Answer]] = defaultdict(dict)
-    kept = sorted((r for r in records if r.part == part), key=lambda r: r.video_id)
-    for video, group in groupby(kept, key=lambda r: r.video_id):
-        said = {r.property: Answer(r.expected == r.predicted, (r.object_id,)) for r in group}
-        for name, one in said.items():
-            found[name][video] = one
-        found["combined"][video] = Answer(all(s.correct for s in said.values()), next(iter(said.values())).objects)
-    return found
+def _heads(classifications: Mapping[int, Sequence[Classification]], catalogue: Catalogue) -> Table:
+    """The heads' test videos, validation videos, and test videos by class: each property, and `combined`, all of a
+    video's."""
+    kinds, entries = {Part.TEST: HEADS, Part.VALIDATION: VALIDATION_HEADS}, list[Entry]()
+    whole: dict[tuple[str, int, str], Answer] = {}
+    levels = {p.name: p.levels for p in catalogue.properties}
+    for seed, c in ((seed, c) for seed, records in classifications.items() for c in records if c.part in kinds):
+        answer, kind = Answer(c.expected == c.predicted, (c.object_id,)), kinds[c.part]
+        entries.append((kind, c.property, RULES, seed, c.video_id, answer))
+        if c.part is Part.TEST:
+            entries.append((RECALL, f"{c.property}: {levels[c.property][c.expected]}", RULES, seed, c.video_id, answer))
+        before = whole.get((kind, seed, c.video_id), answer)
+        whole[kind, seed, c.video_id] = answer._replace(correct=answer.correct and before.correct)
+    entries += [(kind, "combined", RULES, seed, video, answer) for (kind, seed, video), answer in whole.items()]
+    order = [(kind, measure) for kind in kinds.values() for measure in TASKS["OPD"].chance(catalogue)]
+    order += [(RECALL, f"{p.name}: {level}") for p in catalogue.properties for level in p.levels]
+    return _tabled(entries, order)
 
 
 def _shared(answered: Iterable[Mapping[str, Answer]]) -> list[str]:

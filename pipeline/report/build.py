@@ -25,7 +25,6 @@ from pipeline.core.records import (
     Graded,
     GradedVision,
     Measurement,
-    OutOfFold,
     Part,
     Prediction,
     Question,
@@ -37,15 +36,14 @@ from pipeline.core.records import (
 )
 from pipeline.evaluation.calibration import CalibrationRow, calibrated, calibration_rows
 from pipeline.evaluation.grading import EXTERNAL, conclude, vision_models
-from pipeline.evaluation.neighbours import map_frame, means, nearest_neighbours
-from pipeline.evaluation.scores import candidate_rows, effect_rows, score_rows
+from pipeline.evaluation.maps import map_frame, means
+from pipeline.evaluation.scores import effect_rows, score_rows
 from pipeline.report.figures import draw_figures
 from pipeline.report.load import load_report, published
 from pipeline.report.provenance import provenance
 from pipeline.report.readme import render_readme
 from pipeline.report.samples import choose_examples, choose_samples
 from pipeline.report.tables import headline, over_seeds
-from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.split import read_splits
 
@@ -79,8 +77,6 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     files = {seed: data / "encoder" / str(seed) / "classifications.parquet" for seed in sorted(params.ablation.seeds)}
     by_encoder = {seed: said for seed, file in files.items() if (said := _read(file, Classification))}
     asked = {seed: read_jsonl(data / "questions" / str(seed) / "evaluation.jsonl", Question) for seed in by_encoder}
-    every = [question for questions in asked.values() for question in questions]
-    adjectives = {q.question_id: word for q in every if (word := TASKS[q.task].adjective(q, catalogue))}
     # With the folds of a replicate pooled, the heads' classifications and what follows from them by rule.
     pooled: dict[int, list[Classification]] = defaultdict(list)
     concluded: dict[int, list[Score]] = defaultdict(list)
@@ -99,12 +95,8 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     rated = {(g.model, g.shown) for g in vision}
     sources = vision_models(root / EXTERNAL / params.report_name).values()
     origin["vision"] = [s.model_dump(mode="json") for s in sources if (s.model, s.shown) in rated]
-    neighbours, maps = embedded(params, data, catalogue)
-    scores = score_rows(graded, catalogue, pooled, vision, concluded, neighbours, adjectives)
-    write_csv(folder / "scores.csv", ScoreRow, scores)
+    write_csv(folder / "scores.csv", ScoreRow, score_rows(graded, catalogue, pooled, vision, concluded))
     write_csv(folder / "effects.csv", EffectRow, effect_rows(graded, catalogue, concluded))
-    candidates = candidate_rows(neighbours, Encoder.BASE, catalogue.property_names)
-    write_csv(folder / "encoder_effects.csv", EffectRow, candidates)
     write_csv(folder / "calibration.csv", CalibrationRow, calibration_rows(list(by_encoder.values())))
     audit = data / "audit" / "audit.csv"
     write_csv(folder / "audit.csv", Finding, read_csv(audit, Finding) if audit.is_file() else [])
@@ -113,7 +105,7 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
         "confusion.csv": confusion_frame(pooled, catalogue),
         "described.csv": described_frame(by_encoder, params, data, catalogue),
         "curves.csv": curves_frame(data, params.ablation),
-        "map.csv": maps,
+        "map.csv": maps_frame(params, data, catalogue),
     }
     for name, frame in frames.items():
         write_text(folder / name, frame.to_csv(index=False, lineterminator="\n"))
@@ -211,23 +203,17 @@ def confusion_frame(by_seed: Mapping[int, Sequence[Classification]], catalogue: 
     return pd.DataFrame(rows, columns=["seed", "video_id", "property", "rated", "predicted"])
 
 
-def embedded(params: Params, data: Path, catalogue: Catalogue) -> tuple[dict[str, list[OutOfFold]], pd.DataFrame]:
-    """By encoder, the nearest neighbours of test videos among those of their fold, and the maps of the first seed."""
-    neighbours: dict[str, list[OutOfFold]] = {}
+def maps_frame(params: Params, data: Path, catalogue: Catalogue) -> pd.DataFrame:
+    """The maps of test videos by each encoder's embeddings, of the first seed alone."""
+    seed = min(params.ablation.seeds)
     maps = [pd.DataFrame(columns=["encoder", "method", "video_id", "x", "y", *catalogue.property_names])]
-    for seed in sorted(params.ablation.seeds):
-        split = read_table(data / "splits" / f"{seed}.parquet", Assignment)
-        tested = sorted((a for a in split if a.part is Part.TEST), key=lambda a: a.video_id)
-        for encoder in sorted({*params.ablation.encoders} - {Encoder.WORDS}):
-            folder = data / "embeddings" / f"{encoder}-{seed}"
-            if len(tested) < 2 or not (folder / TENSOR_FILE).is_file():
-                continue
-            features = means(folder, tested)
-            found = nearest_neighbours(features, tested, catalogue, params.split.replicate_of(seed))
-            neighbours.setdefault(encoder, []).extend(found)
-            if seed == min(params.ablation.seeds):
-                maps.append(map_frame(features, tested, catalogue).assign(encoder=str(encoder)))
-    return neighbours, pd.concat(maps, ignore_index=True)
+    split = read_table(data / "splits" / f"{seed}.parquet", Assignment)
+    tested = sorted((a for a in split if a.part is Part.TEST), key=lambda a: a.video_id)
+    for encoder in sorted({*params.ablation.encoders} - {Encoder.WORDS}):
+        folder = data / "embeddings" / f"{encoder}-{seed}"
+        if len(tested) > 1 and (folder / TENSOR_FILE).is_file():
+            maps.append(map_frame(means(folder, tested), tested, catalogue).assign(encoder=str(encoder)))
+    return pd.concat(maps, ignore_index=True)
 
 
 def described_frame(

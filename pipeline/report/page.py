@@ -31,14 +31,6 @@ LARGEST = 1_500_000
 SPEED = ("question", "setting", "cost", "unit", "cost_ratio", "error", "error_of", "low", "high", "front")
 STABILITY = ("part", "case", "format", "finite", "error", "bound", "verdict")
 AUDIT = ("check", "item", "measured", "expected", "severity")
-BESIDE = {
-    "calibration": (
-        "Calibration of the heads' probabilities",
-        "Test videos, by the probability of the likeliest class; the row of all has the expected calibration error "
-        "with its interval over objects. The temperature is fitted on validation objects.",
-    ),
-}
-"""CSV files that are tables as they are, with title and caption."""
 DATASET = {
     "property_counts": "Property categories: objects a class",
     "property_combinations": "Property combinations: objects each",
@@ -131,9 +123,9 @@ def _chapter(report: Report, gaps: list[Gap]) -> dict[str, Any]:
 
 def data_tables(folder: Path, dataset: str) -> Iterator[Block]:
     """The tables about encoders and data, of those of a report's files that are there and have rows."""
-    for key, (title, caption) in BESIDE.items():
-        if (file := folder / f"{key}.csv").is_file() and len(frame := pd.read_csv(file)):
-            yield Block(key, title, caption, _shown(frame), file.name)
+    if (file := folder / "calibration.csv").is_file() and len(frame := pd.read_csv(file)):
+        caption = "Expected calibration error on test videos; the temperature is fitted on validation objects."
+        yield Block("calibration", "Calibration of the heads' probabilities", caption, _shown(frame), file.name)
     if (folder / "dataset.csv").is_file():
         frame = pd.read_csv(folder / "dataset.csv", dtype=str).fillna("")
         for key, rows in frame.groupby("table", sort=False):

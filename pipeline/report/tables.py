@@ -15,10 +15,8 @@ import pandas as pd
 import yaml
 
 from pipeline.core.records import (
-    ADJECTIVES,
     ALL_SEEDS,
     HEADS,
-    NEIGHBOURS,
     RECALL,
     VALIDATION_HEADS,
     Shown,
@@ -34,8 +32,6 @@ NOT_ANSWERED = {
     HEADS: "Property heads",
     VALIDATION_HEADS: "Property heads, validation videos",
     RECALL: "Property heads, class by class",
-    NEIGHBOURS: "Nearest neighbour",
-    ADJECTIVES: "By adjective",
 }
 """Tasks of scores.csv that no language model with touch answered, in words."""
 PUBLISHED_MODELS = ("7b", "13b", "CLIP", "PG-InstructBLIP")
@@ -229,8 +225,6 @@ def system(row: dict[str, Any]) -> str:
         return others[touch]
     if task in (HEADS, VALIDATION_HEADS, RECALL):
         return "property heads, no language model"
-    if task == NEIGHBOURS:
-        return str(encoder)
     if not row["lora"]:
         return f"heads and rules, no language model{told}"
     words = [SYSTEM_WORDS[row[axis]] for axis in FULL if row[axis] in SYSTEM_WORDS]

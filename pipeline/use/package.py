@@ -253,22 +253,10 @@ def _write_card(
                     "Property": row.property,
                     "Temperature": f"{config.temperatures[row.property]:.2f}",
                     "Test videos": row.n,
-                    "Expected calibration error": f"{row.error:.3f} [{row.low:.3f}, {row.high:.3f}]",
+                    "Expected calibration error": f"{row.error:.3f}",
                     "Without the temperature": f"{row.without_temperature:.3f}",
                 }
                 for row in calibrated
-                if row.probability == "all"
-            ],
-            "Reliability": [
-                {
-                    "Property": row.property,
-                    "Probability": row.probability,
-                    "n": row.n,
-                    "Mean probability": f"{row.mean_probability:.2f}",
-                    "Right": f"{row.right:.2f}",
-                }
-                for row in calibrated
-                if row.probability != "all"
             ],
         },
     )

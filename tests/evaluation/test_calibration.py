@@ -10,14 +10,7 @@ from scipy.optimize import brentq
 from scipy.special import softmax
 
 from pipeline.core.records import Classification, Part
-from pipeline.evaluation.calibration import (
-    calibration_error,
-    calibration_rows,
-    error_interval,
-    fit_temperature,
-    reliability,
-    rescale,
-)
+from pipeline.evaluation.calibration import calibration_error, calibration_rows, fit_temperature, rescale
 from tests.conftest import classified
 
 
@@ -37,13 +30,9 @@ def drawn(count: int, temperature: float, seed: int = 0) -> list[Classification]
 def test_error_by_hand() -> None:
     """Confidences .95 and .91 in one bin (one right), .6 and .55 in two; .1 steps belong to the bin below them."""
     answers = [said(0, 0.95, 0.05), said(1, 0.91, 0.09), said(0, 0.6, 0.4), said(0, 0.45, 0.55)]
-    bins = reliability(answers)
-    assert [*zip(bins.index, bins["n"], bins["right"], strict=True)] == [(5, 2, 0.5), (9, 2, 0.5)]
-    assert bins["mean_probability"].tolist() == pytest.approx([0.575, 0.93])
     assert calibration_error(answers) == pytest.approx(0.5 * 0.075 + 0.5 * 0.43)
     assert calibration_error([said(0, 1.0, 0.0)]) == pytest.approx(0, abs=1e-9)
     assert calibration_error([said(1, 1.0, 0.0)]) == pytest.approx(1)
-    assert error_interval([said(1, 1.0, 0.0)]) == pytest.approx((1, 1))
 
 
 @pytest.mark.parametrize("temperature", [0.5, 1.0, 3.0])
@@ -83,12 +72,6 @@ def test_rescaling_keeps_a_distribution_and_its_order(values: list[float], tempe
     np.testing.assert_allclose(rescale(p, 1.0), p, atol=1e-9)
 
 
-def test_interval_holds_objects_together() -> None:
-    """Many videos of two objects are no more than two draws: the interval spans from the one to the other."""
-    answers = [said(0, 0.95, 0.05, object_id="a")] * 40 + [said(1, 0.95, 0.05, object_id="b")] * 40
-    assert error_interval(answers) == pytest.approx((0.05, 0.95))
-
-
 def test_rows_have_the_temperature_of_their_own_encoder() -> None:
     """Two encoders that are too sure, each by its own factor, and what all their answers come to."""
     encoders, tested = [], []
@@ -96,13 +79,8 @@ def test_rows_have_the_temperature_of_their_own_encoder() -> None:
         seen = drawn(2000, temperature, seed=number)
         encoders.append([c.model_copy(update={"part": Part.VALIDATION}) for c in seen[:1000]] + seen[1000:])
         tested += seen[1000:]
-    whole, *bins = calibration_rows(encoders)
-    assert (whole.property, whole.probability, whole.n) == ("hardness", "all", 2000)
-    assert whole.without_temperature == pytest.approx(calibration_error(tested), abs=1e-6)
-    assert whole.error < 0.04 < 0.08 < whole.without_temperature
-    assert whole.low < whole.high
-    assert sum(b.n for b in bins) == 2000
-    assert sum(b.n * b.error for b in bins) / 2000 == pytest.approx(whole.error, abs=1e-5)
-    assert [b.error for b in bins] == pytest.approx([abs(b.right - b.mean_probability) for b in bins], abs=2e-6)
-    assert whole.right == pytest.approx(sum(c.predicted == c.expected for c in tested) / 2000, abs=1e-6)
+    (row,) = calibration_rows(encoders)
+    assert (row.property, row.n) == ("hardness", 2000)
+    assert row.without_temperature == pytest.approx(calibration_error(tested), abs=1e-6)
+    assert row.error < 0.04 < 0.08 < row.without_temperature
     assert calibration_rows([]) == []

@@ -1,36 +1,18 @@
-"""Nearest neighbours of other objects, against scikit-learn's; maps keep what is near, and are the same each time."""
+"""Maps of embeddings keep what is near, and are the same each time."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from sklearn.model_selection import LeaveOneGroupOut, cross_val_predict
-from sklearn.neighbors import KNeighborsClassifier
 
 from pipeline.core.records import Assignment, Part
-from pipeline.evaluation.neighbours import map_frame, nearest_neighbours
+from pipeline.evaluation.maps import map_frame
 from tests.evaluation.conftest import CATALOGUE
 
 
 def videos(objects: int, each: int) -> list[Assignment]:
     names = list(CATALOGUE.objects)[:objects]
     return [Assignment(video_id=f"{o}_{i}", object_id=o, part=Part.TEST) for o in names for i in range(each)]
-
-
-@pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
-def test_neighbours_are_those_of_a_library(scale: float) -> None:
-    tested = videos(15, 3)
-    features = scale * np.random.default_rng(1).normal(size=(len(tested), 5)) + scale
-    found = nearest_neighbours(features, tested, CATALOGUE, repeat=2)
-    assert [r.video_id for r in found] == [v.video_id for v in tested]
-    assert {r.repeat for r in found} == {2}
-    groups = [v.object_id for v in tested]
-    for place in range(len(CATALOGUE.properties)):
-        labels = np.array([CATALOGUE.labels(o)[place] for o in groups])
-        model = KNeighborsClassifier(1, algorithm="brute")
-        expected = cross_val_predict(model, features, labels, groups=groups, cv=LeaveOneGroupOut())
-        assert [r.predicted[place] for r in found] == expected.tolist()
-    assert nearest_neighbours(np.zeros((3, 2)), videos(1, 3), CATALOGUE, 0) == [], "one object has none"
 
 
 @pytest.mark.parametrize("count", [2, 3, 40])
@@ -50,7 +32,7 @@ def test_a_map_has_each_video_once_a_method_and_keeps_clusters_apart(count: int)
 
 
 def test_of_many_videos_a_map_has_some_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.evaluation.neighbours.MAPPED", 40)
+    monkeypatch.setattr("pipeline.evaluation.maps.MAPPED", 40)
     tested = videos(20, 3)
     found = map_frame(np.random.default_rng(0).normal(size=(60, 3)), tested, CATALOGUE)
     shown = found[found["method"] == "PCA"]

@@ -9,10 +9,10 @@ import pytest
 from sklearn.metrics import recall_score
 
 from pipeline.core.io import read_csv, write_csv
-from pipeline.core.records import Classification, EffectRow, OutOfFold, Part, ScoreRow
+from pipeline.core.records import Classification, EffectRow, Part, ScoreRow
 from pipeline.evaluation.intervals import accuracy_interval
 from pipeline.evaluation.paired import paired
-from pipeline.evaluation.scores import candidate_rows, effect_rows, score_rows, with_holm
+from pipeline.evaluation.scores import effect_rows, score_rows, with_holm
 from pipeline.tasks import TASKS
 from tests.conftest import classified
 from tests.evaluation.conftest import CATALOGUE, PAIRS, graded
@@ -74,20 +74,6 @@ def test_tasks_and_measures_come_from_the_registry(monkeypatch: pytest.MonkeyPat
     assert [(r.part, r.task, r.measure) for r in effect_rows(answers + less, CATALOGUE)] == [("lora", "LATER", "shape")]
 
 
-def test_answers_are_counted_adjective_by_adjective() -> None:
-    """Of the full system and the rules alone; a word that a setting was never asked by has no row."""
-    right = drawn()
-    full, less = graded("PC", right), graded("PC", drawn(), lora="without")
-    words = {g.question_id: "softer" if number % 3 else "harder" for number, g in enumerate(full)}
-    rows = score_rows(full + less, CATALOGUE, adjectives={**words, "another": "hardest"})
-    found = {r.measure: r for r in rows if r.task == "adjective"}
-    assert found.keys() == {"PC: softer", "PC: harder"}
-    assert {(r.lora, r.seed) for r in found.values()} == {("with", "all")}
-    own = [ok for number, ok in enumerate(right) if number % 3 == 0]
-    assert (found["PC: harder"].n, found["PC: harder"].right) == (5, sum(own))
-    assert [r for r in rows if r.task != "adjective"] == score_rows(full + less, CATALOGUE)
-
-
 def test_one_object_has_an_accuracy_but_no_interval(tmp_path: Path) -> None:
     alone = [("object0",)] * 4
     answers = graded("OPD", [True, False, True, True], measure="combined", objects=alone)
@@ -133,6 +119,7 @@ def test_effects_are_the_full_system_less_one_part() -> None:
 
 
 Classes = tuple[int, int, int]
+ABOUT = [("a",), ("a",), ("b",), ("c",)]
 
 
 def heads(part: Part, predicted: dict[str, Classes], expected: Classes) -> list[Classification]:
@@ -172,51 +159,6 @@ def test_recall_of_each_class_is_scikit_learns() -> None:
             found = row(rows, task="heads_recall", seed="all", measure=f"{p.name}: {p.levels[level]}")
             assert (found.accuracy, found.n) == (pytest.approx(recall, abs=1e-6), true.count(level))
     assert {r.measure for r in rows if r.task == "heads_recall" and "bump" in r.measure} == {"bumpiness: big bumps"}
-
-
-def out_of_fold(predicted: list[tuple[tuple[int, ...], ...]]) -> list[OutOfFold]:
-    """Repeats x videos x properties of four videos of three objects, in which nothing but zeros is right."""
-    videos = ("a_0", "a_1", "b_0", "c_0")
-    return [
-        OutOfFold(video_id=v, object_id=v[0], repeat=r, expected=(0, 0, 0), predicted=p)
-        for r, repeat in enumerate(predicted)
-        for v, p in zip(videos, repeat, strict=True)
-    ]
-
-
-ABOUT = [("a",), ("a",), ("b",), ("c",)]
-RIGHT, WRONG, HALF = (0, 0, 0), (2, 1, 1), (0, 0, 1)
-FROZEN = out_of_fold([(RIGHT, HALF, WRONG, RIGHT), (HALF, RIGHT, RIGHT, RIGHT)])
-CONSTANT = out_of_fold([(WRONG, HALF, WRONG, RIGHT), (HALF, HALF, WRONG, RIGHT)])
-
-
-def test_nearest_neighbours_are_the_mean_over_repeats() -> None:
-    rows = score_rows([], CATALOGUE, neighbours={"base": FROZEN})
-    rows = [r for r in rows if ":" not in r.measure]
-    named = {(r.task, r.encoder, r.lora, r.opd, r.touch, r.seed, r.n) for r in rows}
-    assert named == {("nearest_neighbour", "base", "", "", "", "all", 4)}
-    combined = row(rows, measure="combined")
-    shares = np.array([0.5, 0.5, 0.5, 1])
-    assert (combined.accuracy, combined.right) == (shares.mean(), shares.sum())
-    assert (combined.low, combined.high) == pytest.approx(accuracy_interval(shares, ABOUT), abs=1e-6)
-    assert row(rows, measure="hardness").accuracy == pytest.approx(7 / 8)
-
-
-def test_encoders_are_compared_video_by_video() -> None:
-    (found,) = candidate_rows({"backbone": FROZEN, "constant": CONSTANT}, "backbone", ())
-    assert (found.part, found.change) == ("encoder", "constant - backbone")
-    assert (found.n, found.objects, found.seeds) == (4, 3, 2)
-    gains = np.array([[-1, 0, 0, 0], [0, -1, -1, 0]], dtype=float)
-    gap = paired(gains, ABOUT)
-    expected = (gap.difference, gap.low, gap.high, gap.p)
-    assert (found.difference, found.low, found.high, found.p) == pytest.approx(expected, abs=1e-6)
-    assert found.p_holm == found.p
-    assert candidate_rows({"constant": CONSTANT}, "backbone", ()) == []
-    rows = candidate_rows({"backbone": FROZEN, "constant": CONSTANT}, "backbone", CATALOGUE.property_names)
-    assert [r.measure for r in rows] == ["combined", *CATALOGUE.property_names]
-    assert rows[0].difference == found.difference
-    hardness = np.mean([r.expected[0] == r.predicted[0] for r in CONSTANT]) - 7 / 8
-    assert rows[1].difference == pytest.approx(hardness, abs=1e-6)
 
 
 def test_holm_over_effects_some_of_which_have_no_p() -> None:

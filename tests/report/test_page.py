@@ -153,13 +153,13 @@ def test_what_is_missing_is_said_with_the_reason(changed: Path, monkeypatch: pyt
     (reports / "stability.csv").write_text("part,case\n")
     (reports / "smoke-scenes" / "provenance.json").write_text('{"scale": "smoke", "source": "scenes"}')
     scores = reports / "small-videos" / "scores.csv"
-    write_rows(scores, [row for row in rows_of(scores) if row["task"] not in ("PSR", "nearest_neighbour")])
+    write_rows(scores, [row for row in rows_of(scores) if row["task"] not in ("PSR", "heads_recall")])
     monkeypatch.chdir(changed)
     Path("dvc.yaml").touch()  # As in a project.
     assert CliRunner().invoke(app, ["page"]).output.startswith(f"{PAGE}: ")
     page = Page(changed / PAGE)
     said = {words(e[0]): words(e[1]) for e in page.named("missing").iter("div")}
-    for what in ("effects.csv", "Scenario", "What embeddings tell by themselves"):
+    for what in ("effects.csv", "Scenario", "Recall of the property heads"):
         assert what in said["small-videos"]
     assert "scores.csv" in said["small-scenes"]
     assert "lacks" in said["smoke-scenes"]

@@ -84,6 +84,15 @@ def test_each_of_the_papers_tables_changes_one_part_only(key: str, systems: list
     assert all(shown[PRINTED[0]])
 
 
+def test_all_other_variants_are_those_that_no_table_of_an_ablation_has() -> None:
+    axes = itertools.product(("base", "finetuned"), ("without", "with"), ("none", "needed", "all"))
+    shown = build("variants", *(score(variant=" ".join(v)) for v in axes))
+    left = ["finetuned with needed", "finetuned without none", "base with none", "base without all"]
+    found = [" ".join(row) for row in shown[["Encoder", "LoRA", "OPD"]].itertuples(index=False)]
+    assert {v.replace("finetuned", "fine-tuned") for v in left} < {*found}
+    assert len(found) == 12 - 4
+
+
 def test_tasks_stand_where_they_belong_whole_answers_first() -> None:
     heads = {"variant": "finetuned  ", "measure": "combined"}
     rows = [score(task, variant="finetuned with all") for task in ("PSR", "POM", "PC")]
@@ -95,7 +104,7 @@ def test_tasks_stand_where_they_belong_whole_answers_first() -> None:
     assert tasks["reasoning"] == ["PSR"]
     assert tasks["description"] == ["OPD", "heads"]
     whole = ["OPD", "PC", "POM", "PSR"]
-    assert tasks["variants"] == tasks["touch"] == list(headline(whole_report.scores)["task"]) == whole
+    assert tasks["touch"] == list(headline(whole_report.scores)["task"]) == whole
     assert tasks["heads"] == ["heads", "heads_validation"]
     assert list(build("description", *rows)["Measure"])[:2] == ["all properties right", "hardness"]
     assert list(build("description", *rows)["Published CLIP % (n, ~ inferred)"]) == ["", "", "57.89 (~38)"]
@@ -108,7 +117,7 @@ def test_nothing_measured_is_no_table() -> None:
 def test_a_new_task_is_in_all_tables_of_its_kind(monkeypatch: pytest.MonkeyPatch) -> None:
     toy = SimpleNamespace(title="Telling toys apart", trained=True, measure="choice", told="")
     monkeypatch.setitem(TASKS, "TOY", toy)
-    for table in (FIVE_TASKS, BY_KEY["understanding"], BY_KEY["variants"]):
+    for table in (FIVE_TASKS, BY_KEY["understanding"], BY_KEY["touch"]):
         assert list(table.build(report([score("TOY")]))["Task"]) == ["Telling toys apart (TOY)"]
     assert build("reasoning", score("TOY")).empty
 

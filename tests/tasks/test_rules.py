@@ -133,5 +133,5 @@ def test_rules_are_a_system_of_their_own_in_scores_and_effects() -> None:
         (row,) = (r for r in rows if (r.task, r.measure, r.seed) == (task, TASKS[task].measure, "all"))
         own = [s.correct for s in concluded[0] if (s.task, s.measure) == (task, TASKS[task].measure)]
         assert row.accuracy == pytest.approx(sum(own) / len(own), abs=1e-6)
-    assert RULES.lora is None
+    assert RULES.lora == ""
     assert effect_rows([], CATALOGUE, concluded) == []
