@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from jinja2 import UndefinedError
 from markupsafe import Markup
 
 from pipeline.config.params import PARAMS_FILE, load_params
@@ -69,7 +70,7 @@ def write_page(root: Path) -> Path:
             chapters.append({**_chapter(load_report(place), gaps), "current": place.name == current})
         except (UserError, ValueError) as error:
             gaps.append((place.name, "the whole report", str(error).replace(f"{folder}/", "")))
-        except KeyError as error:
+        except (KeyError, UndefinedError) as error:
             gaps.append((place.name, "the whole report", f"its provenance.json lacks {error}; write it anew"))
     if not chapters:
         raise UserError(f"{folder}: no whole report yet; `make repro` writes one")
