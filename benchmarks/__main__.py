@@ -11,7 +11,7 @@ from benchmarks.figures import draw
 from benchmarks.table import CSV, Row, merge
 from pipeline.core.errors import UserError
 
-SECTIONS = ("frames", "encoder", "language", "contact", "systems", "serving", "recognise", "training")
+SECTIONS = ("frames", "encoder", "contact", "systems", "serving", "training")
 """Modules beside this one with a `measure(root)` that gives rows. Another section is a module and its name here."""
 
 

@@ -1,4 +1,4 @@
-"""The classifier that compares frame rules and contact models: frozen EfficientNet-lite0, the chain's frame heads."""
+"""The classifier that compares numbers and sizes of frames: a frozen EfficientNet-lite0, the chain's frame heads."""
 
 from __future__ import annotations
 
@@ -38,19 +38,14 @@ def _backbone(folder: Path) -> FrameEncoder:
 @torch.inference_mode()
 def features(pictures: np.ndarray, folder: Path) -> np.ndarray:
     """float32, pictures x features, of difference pictures, uint8, pictures x height x width x RGB."""
-    found: torch.Tensor = _backbone(folder)(torch.from_numpy(pictures), torch.zeros(len(pictures), dtype=torch.int64))
-    rows: np.ndarray = found.numpy()
-    return rows
+    return np.asarray(_backbone(folder)(torch.from_numpy(pictures), torch.zeros(len(pictures), dtype=torch.int64)))
 
 
-def heads_error(
-    learnt: Clips, tested: Clips, objects: Sequence[str], catalogue: Catalogue, folds: int, deals: int
-) -> Error:
+def heads_error(clips: Clips, objects: Sequence[str], catalogue: Catalogue, folds: int, deals: int) -> Error:
     """`table.WRONG` of frame heads in grouped folds, their penalty chosen inside the training objects.
 
     Args:
-        learnt: What the heads are trained on: videos x frames x features.
-        tested: What they are tested on, of the same videos in the same order.
+        clips: Videos x frames x features.
         objects: Each video's object; folds depend on these alone.
         deals: How often the folds are dealt.
     """
@@ -60,8 +55,8 @@ def heads_error(
     for repeat in range(deals):
         for number, held in enumerate(deal(objects, folds, derive_seed(0, "folds", repeat))):
             out = np.isin(owners, list(held))
-            training = (learnt[~out], labels[~out], owners[~out].tolist(), classes)
+            training = (clips[~out], labels[~out], owners[~out].tolist(), classes)
             strength, _ = choose_strength(*training, derive_seed("votes", repeat, number))
-            found = fit_frame_heads(*training, strength).predict(tested[out])
+            found = fit_frame_heads(*training, strength).predict(clips[out])
             wrong[out] += (found != labels[out]).any(axis=1)
     return share_of(wrong / deals, [(o,) for o in objects])

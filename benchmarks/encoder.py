@@ -5,7 +5,6 @@ The encoder is frozen and has seen no label; each size is judged by a grouped cr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,7 +15,7 @@ import torch
 
 from benchmarks.classifier import heads_error
 from benchmarks.frames import bench_videos
-from benchmarks.table import WRONG, Row, interleaved, machine, make_rows
+from benchmarks.table import WRONG, Row, machine, make_rows, timed
 from pipeline.config import PRETRAINED, FramesConfig
 from pipeline.core.errors import UserError
 from pipeline.encoder.data import ClipDataset, LabelledVideo
@@ -29,8 +28,8 @@ SIDES, FRAMES = (120, 90, 60, 30), 5
 """Sides of frames in pixels, the baseline first, and frames per video."""
 
 
-def measure(root: Path, timed: int = 25, repeats: int = 5, folds: int = 5, deals: int = 3) -> list[Row]:
-    """Errors over all `frames.bench_videos`, costs over `timed` of them; UserError without pretrained weights."""
+def measure(root: Path, folds: int = 5, deals: int = 3) -> list[Row]:
+    """Errors over all `frames.bench_videos`, costs over them but the first; UserError without pretrained weights."""
     folder, catalogue = bench_videos(root, folds)
     pretrained = root / PRETRAINED
     if not pretrained.is_file():
@@ -41,35 +40,33 @@ def measure(root: Path, timed: int = 25, repeats: int = 5, folds: int = 5, deals
     encoder.eval()
 
     @torch.inference_mode()
-    def describe(pictures: Sequence[torch.Tensor], video: int) -> np.ndarray:
-        found: np.ndarray = encoder.describe(pictures[video], items[video]["frame_indices"]).numpy()
-        return found
+    def describe(pictures: torch.Tensor, frame_indices: torch.Tensor) -> np.ndarray:
+        return np.asarray(encoder.describe(pictures, frame_indices))
 
     config = FramesConfig(selection="salient", pixels=SIDES[0])
+    found: dict[str, list[tuple[np.ndarray, float]]] = {f"{side} pixels": [] for side in SIDES}
     with TemporaryDirectory() as made:
         videos = extract_frames(folder, catalogue, config, Path(made) / "frames", Path(made) / "partial").videos
         store = FrameStore(Path(made) / "frames", "subtract")
         clips = ClipDataset(store, [LabelledVideo(v.video_id, ()) for v in videos], per_video=FRAMES)
-        items = [clips[video] for video in range(len(videos))]
+        # All sizes have their turn at a video before the next, so that a busy machine slows all alike.
+        for item in (clips[place] for place in range(len(videos))):
+            for side, own in zip(SIDES, found.values(), strict=True):
+                # Difference pictures, uint8, k x side x side x RGB, by area.
+                shape, method = (side, side), cv2.INTER_AREA
+                resized = [cv2.resize(p, shape, interpolation=method) for p in item["frames"].numpy()]
+                own.append(timed(partial(describe, torch.from_numpy(np.stack(resized)), item["frame_indices"])))
     objects = [video.object_id for video in videos]
-    runs, errors = {}, {}
-    for side in SIDES:
-        # Difference pictures, uint8, k x side x side x RGB, by area.
-        shape, method = (side, side), cv2.INTER_AREA
-        resized = [[cv2.resize(p, shape, interpolation=method) for p in item["frames"].numpy()] for item in items]
-        pictures = [torch.from_numpy(np.stack(own)) for own in resized]
-        runs[f"{side} pixels"] = partial(describe, pictures)
-        seen = np.stack([describe(pictures, video) for video in range(len(videos))])
-        errors[f"{side} pixels"] = heads_error(seen, seen, objects, catalogue, folds, deals)
-    # At equal distances in the order of the videos, which is by object.
-    count = min(timed, len(videos))
     return make_rows(
         "frame size",
-        interleaved(runs, [i * len(videos) // count for i in range(count)], repeats),
+        {name: [spent for _, spent in own[1:]] for name, own in found.items()},  # The first one warms up.
         unit="ms a video, encoder alone",
         baseline=f"{SIDES[0]} pixels",
-        errors=errors,
+        errors={
+            name: heads_error(np.stack([seen for seen, _ in own]), objects, catalogue, folds, deals)
+            for name, own in found.items()
+        },
         error_of=WRONG,
-        counts={name: {"frames": float(FRAMES)} for name in runs},
+        counts={name: {"frames": float(FRAMES)} for name in found},
         machine=machine("1 thread"),
     )

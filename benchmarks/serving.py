@@ -7,7 +7,6 @@ import json
 import signal
 import subprocess
 import sys
-import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -82,18 +81,15 @@ def body(video: Path) -> bytes:
 
 
 def post(address: str, data: bytes) -> str:
-    """The answer; the request is sent again while the server says that it is full."""
+    """The answer; the server has a place for each of the clients."""
     request = urllib.request.Request(
         f"{address}/chat/completions", data, headers={"Content-Type": "application/json"}, method="POST"
     )
-    while True:
-        try:
-            with urllib.request.urlopen(request, timeout=600) as response:
-                return str(json.load(response)["choices"][0]["message"]["content"])
-        except urllib.error.HTTPError as error:
-            if error.code != 429:
-                raise UserError(f"the server answers {error.code}: {error.read().decode()[:200]}") from None
-            time.sleep(0.1)
+    try:
+        with urllib.request.urlopen(request, timeout=600) as response:
+            return str(json.load(response)["choices"][0]["message"]["content"])
+    except urllib.error.HTTPError as error:
+        raise UserError(f"the server answers {error.code}: {error.read().decode()[:200]}") from None
 
 
 @contextmanager

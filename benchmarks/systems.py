@@ -1,4 +1,4 @@
-"""The shipped model against its own heads and rules, and its tokens a second against the machine's limits."""
+"""The shipped model against its own heads and rules, and its tokens a second, alone and in a batch."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from pipeline.config.params import load_params
 from pipeline.core.errors import UserError
 from pipeline.core.io import read_csv
 from pipeline.core.records import ScoreRow, Shown
-from pipeline.scales.cost import measured_rate
 from pipeline.use.folder import SHIPPED
 from pipeline.use.model import Octopi
 from pipeline.videos.files import video_files
@@ -69,27 +68,20 @@ def measure(root: Path, triples: int = 12, batch: int = 32) -> list[Row]:
 
 
 def tokens(octopi: Octopi, videos: list[Path], batch: int) -> list[Row]:
-    """Milliseconds per token, including its share of reading the question, beside the lower bound of the machine.
-
-    A token cannot come sooner than all weights are read from memory (shared by the answers of a batch) or multiplied.
-    """
+    """Milliseconds per token, including its share of reading the question."""
     asked = [(DESCRIBE, videos[i % len(videos)]) for i in range(batch)]
     octopi.ask_all(asked)  # So that all videos are encoded.
-    block = torch.ones(2**27)
-    read = min(timed(block.sum)[1] for _ in range(5)) / (4 * block.numel())
-    parameters = sum(p.numel() for p in octopi.llm.parameters())
-    multiplied = 2e3 * parameters / measured_rate()
-    costs, notes = {}, {}
+    costs = {}
     for count in (1, batch):
         taken = []
         for start in range(0, batch, count):
             said, ms = timed(partial(octopi.ask_all, asked[start : start + count]))
             taken.append(ms / sum(len(octopi.llm.tokenizer(text).input_ids) + 1 for text in said))
-        least = max(4 * parameters * read / count, multiplied)
-        name = f"{count} at a time"
-        costs[name] = taken if count == 1 else taken * batch
-        limit = "arithmetic" if least == multiplied else "memory"
-        notes[name] = f"{least / fmean(taken):.0%} of what {limit} allows"
-    rows = make_rows("a token of the shipped model", costs, unit="ms a token", baseline="1 at a time")
-    place = f"{machine(f'{torch.get_num_threads()} threads')}, memory read at {1e-6 / read:.0f} GB/s"
-    return [row.model_copy(update={"machine": f"{place}; {notes[row.setting]}"}) for row in rows]
+        costs[f"{count} at a time"] = taken if count == 1 else taken * batch
+    return make_rows(
+        "a token of the shipped model",
+        costs,
+        unit="ms a token",
+        baseline="1 at a time",
+        machine=machine(f"{torch.get_num_threads()} threads"),
+    )

@@ -1,11 +1,10 @@
-"""What sections share: times of settings that take turns, errors with intervals, rows of reports/speed_error.csv."""
+"""What sections share: times, errors with intervals, rows of reports/speed_error.csv."""
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from statistics import fmean, median, stdev
 from time import perf_counter
@@ -23,7 +22,6 @@ from pipeline.evaluation.intervals import accuracy_interval
 CSV = Path("reports") / "speed_error.csv"
 WRONG = "share of videos of unseen objects of which not every property is right"
 R = TypeVar("R")
-T = TypeVar("T")
 
 
 def timed(run: Callable[[], R]) -> tuple[R, float]:
@@ -31,27 +29,6 @@ def timed(run: Callable[[], R]) -> tuple[R, float]:
     started = perf_counter()
     found = run()
     return found, 1000 * (perf_counter() - started)
-
-
-def interleaved(
-    settings: Mapping[str, Callable[[T], object]], items: Sequence[T], repeats: int, warm: bool = True
-) -> dict[str, list[float]]:
-    """Milliseconds per item: for each setting one value per repeat, the median over the items.
-
-    All settings have their turn at an item before the next item, so that a busy machine slows all alike. Every one is
-    run once before, uncounted, unless `warm` is False.
-    """
-    for run in settings.values() if warm else ():
-        run(items[0])
-    found: dict[str, list[float]] = {name: [] for name in settings}
-    for _ in range(repeats):
-        spent: dict[str, list[float]] = {name: [] for name in settings}
-        for item in items:
-            for name, run in settings.items():
-                spent[name].append(timed(partial(run, item))[1])
-        for name, own in spent.items():
-            found[name].append(median(own))
-    return found
 
 
 def machine(threads: str) -> str:
@@ -112,8 +89,6 @@ class Row(Record):
     """Cost divided by that of the question's baseline: the median of this ratio over the repeats."""
     frames: float | None = None
     """Frames per video."""
-    tokens: float | None = None
-    """Tokens generated per answer."""
     megabytes: float | None = None
     """Peak of memory, in 10^6 bytes."""
     error: float | None = None
@@ -152,7 +127,7 @@ def make_rows(
         costs: By setting, one value per repeat in `unit`; the n-th values of all settings were measured together.
         baseline: The setting whose ratio is 1.
         errors: By setting; a setting without an error is not on the front.
-        counts: By setting, the values of count columns (`frames`, `tokens`, `megabytes`) by their names.
+        counts: By setting, the values of count columns (`frames`, `megabytes`) by their names.
     """
     errors, counts = errors or {}, counts or {}
     rows = []

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from benchmarks import __main__ as command
 from benchmarks.figures import FOLDER, draw
-from benchmarks.table import CSV, Error, Row, front, interleaved, make_rows, mean_of, merge, read_rows, share_of
+from benchmarks.table import CSV, Error, Row, front, make_rows, mean_of, merge, read_rows, share_of
 from pipeline.core.records import ScoreRow
 from tests.conftest import refused
 
@@ -83,14 +83,6 @@ def test_a_figure_a_question_and_stale_ones_go(tmp_path: Path) -> None:
     assert all(p.read_bytes().startswith(b"\x89PNG") for p in drawn)
 
 
-def test_settings_take_turns_at_each_item() -> None:
-    seen: list[tuple[str, int]] = []
-    settings = {name: (lambda i, name=name: seen.append((name, i))) for name in "ab"}
-    costs = interleaved(settings, [1, 2], 2, warm=False)
-    assert seen == 2 * [("a", 1), ("b", 1), ("a", 2), ("b", 2)]
-    assert {name: len(own) for name, own in costs.items()} == {"a": 2, "b": 2}
-
-
 def test_errors_have_intervals_over_objects() -> None:
     one = mean_of([1.0, 3.0, 2.0, 2.0], ["a", "a", "b", "b"])
     assert (one.value, one.low, one.high) == (2, 2, 2)
@@ -120,5 +112,5 @@ def test_the_command_merges_and_names_what_is_allowed(
     assert [row.question for row in read_rows(CSV)] == ["other", "contact", "contact"]
     assert (CSV.parent / FOLDER / "contact.png").is_file()
     assert "x 2  error 0.05 (front)" in capsys.readouterr().out
-    with pytest.raises(SystemExit, match="frames, encoder, language, contact, systems, serving"):
+    with pytest.raises(SystemExit, match="frames, encoder, contact, systems, serving, training"):
         command.main(["startup"])
