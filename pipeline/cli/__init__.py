@@ -57,7 +57,6 @@ def scale(
     ],
     overrides: Annotated[list[str] | None, typer.Argument(help="key=value, for example split.name=kfold.")] = None,
     plan: Annotated[bool, typer.Option("--plan", help="Say what it would take, and write nothing.")] = False,
-    card: Annotated[str, typer.Option(help="GPU to count hours for: rtx3090, rtx4090, a6000, a100 or h100.")] = "",
 ) -> None:
     """Choose what `dvc repro` runs: write params.yaml from conf/NAME.yaml and the overrides."""
     from pipeline.config.params import in_project
@@ -71,10 +70,13 @@ def scale(
         raise UserError(f"{running[0]} is running, and would be recorded with other parameters; wait for it or stop it")
     params = compose(name, overrides or ())
     shapes = read_shapes(params)
-    uses = count(params, shapes)
     # First, since what a scale takes is asked before its weights are fetched.
-    counted = ["Memory in GiB on each device, counted from shapes:", table(uses)] if uses else []
-    typer.echo("\n".join([*counted, *shapes.notes, *costs(params, shapes, uses, card)]))
+    memory = (
+        ["Memory in GiB on each device, counted from shapes:", table(uses)]
+        if (uses := [*count(params, shapes)])
+        else []
+    )
+    typer.echo("\n".join([*memory, *shapes.notes, *costs(params, shapes)]))
     if plan:
         typer.echo(f"{len(params.ablation.variants())} variants; nothing is written.")
         return

@@ -1,8 +1,8 @@
 """The memory that each stage of a scale takes on a device, counted from shapes before anything runs.
 
-Counted are weights, what training adds to them, the values that a backward pass reads again, the widest passing values,
-and the keys and values of an answer in the making. Not counted are the CUDA context, fragmentation and kernels'
-workspaces: one or two GiB on a card. Tests compare the counted activations with what autograd keeps.
+Counted are weights, what training adds to them, the larger values that a backward pass reads again, the widest passing
+ones, and the keys and values of an answer in the making. Not counted are Python and its libraries, or a CUDA context
+with fragmentation: one or two GiB. The scale `rehearsal` was measured (docs/scale.md), and tests hold this to it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import yaml
 
-from pipeline.config import EncoderConfig, LoraTrainConfig, Params, TrainConfig
+from pipeline.config import Params
 from pipeline.core.errors import UserError
 from pipeline.core.records import Part
 from pipeline.scenes.invented import catalogue_of
@@ -29,18 +29,12 @@ if TYPE_CHECKING:
     from transformers import PreTrainedModel
 
 GIB = 2**30
-FLOAT32_BYTES = 4
-"""Bytes of a float32 value."""
-BYTES = {"auto": 4, "float32": 4, "bfloat16": 2, "float16": 2}
+BYTES = {"none": 4, "auto": 4, "float32": 4, "bfloat16": 2, "float16": 2}
 """Bytes a value; for `auto` the most, since its format depends on the device."""
 NF4 = 0.5 + 1 / 64 + 4 / (64 * 256)
 """Bytes a value: four bits, a byte of scale for 64 of them, and a float32 for 256 such bytes (Dettmers et al. 2023)."""
-ADAM = 3 * FLOAT32_BYTES
+ADAM = 12
 """Bytes a trained value besides its own: its gradient, and Adam's two means."""
-GATHERED = 2
-"""Layers whose weights a sharded training holds whole: the one that computes and the one that is fetched."""
-READ_TOGETHER = ({"q_proj", "k_proj", "v_proj"}, {"gate_proj", "up_proj"}, {"down_proj"})
-"""Linear maps that read the same tensor, kept only for an adapter. What `o_proj` reads, attention keeps anyway."""
 ASKED = 30
 """Questions of each task among which the longest conversation is looked for."""
 LETTERS = 4
@@ -65,28 +59,14 @@ class Use(NamedTuple):
         return sum(self[2:])
 
 
-class Lengths(NamedTuple):
-    """Tokens of the longest conversations, and the mean over all."""
-
-    training: int
-    """Question and answer, under any OPD mode that is trained."""
-    answer: int
-    """Of `training`, the tokens that are learnt."""
-    prompt: int
-    """The longest evaluation question, with the answers of earlier turns."""
-    mean_training: float = 0.0
-    mean_answer: float = 0.0
-    mean_prompt: float = 0.0
-
-
 class Shapes(NamedTuple):
-    """What memory, time and disk are counted from; models lie on torch's meta device, without values."""
+    """What memory and disk are counted from; models lie on torch's meta device, and are None where not known."""
 
     catalogue: Catalogue
     tower: VisionTransformer | None
     llm: PreTrainedModel | None
-    lengths: Lengths
-    """All 0 where the language model's shapes are not known."""
+    longest: tuple[int, int]
+    """Tokens of the longest conversation, and those of them that are learnt."""
     embedding: int
     """Values of a frame's embedding as the language model gets it; where the encoder's shapes are not known, as many as
     a word's embedding has."""
@@ -95,133 +75,96 @@ class Shapes(NamedTuple):
 
 
 def read_shapes(params: Params) -> Shapes:
-    """Read the base models' shapes, and look for the longest conversations."""
-    catalogue = catalogue_of(params)
-    encoder, language = Path(params.encoder.weights), Path(params.language.weights)
+    """Read the base models' shapes, and look for the longest conversation."""
+    catalogue, config = catalogue_of(params), params.encoder
+    encoder, language = Path(config.weights), Path(params.language.weights)
     tower, llm = read_tower(encoder), read_language(language)
     notes = ["language.dtype is auto: counted as float32."] if params.language.dtype == "auto" else []
-    for folder, model, kind, stages in (
-        (encoder, tower, "open_clip model", "encoder's"),
-        (language, llm, "Llama", "language model's"),
-    ):
+    for folder, model in ((encoder, tower), (language, llm)):
         if model is None:
-            notes.append(f"{folder}: no {kind} whose shapes are known; the {stages} stages are not counted.")
+            notes.append(f"{folder}: its shapes are not known; stages that run it are not counted.")
         elif not folder.is_dir():
             notes.append(f"{folder} is not there: counted with the shapes that are published for {folder.name}.")
-    lengths, embedding = Lengths(0, 0, 0), 0
-    if llm is not None:
-        lengths, embedding = longest(params, catalogue, language), llm.config.hidden_size
-        if not (language / TOKENIZER).is_file():
-            notes.append(f"Without its tokenizer, a token is taken for {LETTERS} letters.")
-        notes.append(
-            f"Longest conversation {lengths.training} tokens, {lengths.answer} of them learnt; longest question "
-            f"{lengths.prompt}, answered in at most {params.language.max_new_tokens}."
-        )
-    if params.encoder.embedding == "logits":
+    embedding = llm.config.hidden_size if llm is not None else 0
+    if config.embedding == "logits":
         embedding = sum(len(p.levels) for p in catalogue.properties)
     elif tower is not None:
-        embedding = features(params.encoder, tower)
-    return Shapes(catalogue, tower, llm, lengths, embedding, notes)
+        embedding = features(params, tower)
+    return Shapes(catalogue, tower, llm, longest(params, catalogue, language), embedding, notes)
 
 
-def count(params: Params, shapes: Shapes) -> list[Use]:
-    """The memory of each stage that runs a base model of known shapes; `finetune_encoder` with prompts alone."""
-    uses, config, tower = list[Use](), params.encoder, shapes.tower
-    if tower is not None:
-        width, depth = tower.transformer.width, len(layers(tower))
-        classes = sum(len(p.levels) for p in shapes.catalogue.properties)
-        if config.recipe in ("paper", "release"):
-            trained = min(depth, config.prompt_layers or depth) * config.prompts * width
-            if config.recipe == "paper":
-                trained += (width + 1) * width + (features(config, tower) + 1) * classes
-            else:
-                trained += (width + 1) * 512 + 513 * classes
-            pictures = params.frames.per_video * min(config.micro_batch_size or config.batch_size, config.batch_size)
-            size = BYTES["float32" if config.autocast == "none" else config.autocast]
-            activations = sum(tower_kept(tower, pictures, config.prompts, size))
-            held = FLOAT32_BYTES * (parameters(tower) + trained)
-            uses.append(Use("finetune_encoder", 1, held, ADAM * trained, activations))
-        _, passing = tower_kept(tower, config.embed_batch_size, config.prompts, FLOAT32_BYTES)
-        uses.append(Use("embed", 1, FLOAT32_BYTES * parameters(tower), 0, passing))
-    if shapes.llm is not None:
-        uses += language_uses(params, shapes.llm, shapes.embedding, shapes.lengths)
-    return uses
-
-
-def features(config: EncoderConfig, tower: VisionTransformer) -> int:
+def features(params: Params, tower: VisionTransformer) -> int:
     """Values of a picture that are read of a tower."""
-    whole = config.recipe == "release" or (config.recipe == "paper" and config.embedding == "class_token")
+    recipe, embedding = params.encoder.recipe, params.encoder.embedding
+    whole = recipe == "release" or (recipe == "paper" and embedding == "class_token")
     return int(tower.transformer.width if whole else tower.output_dim)
 
 
-def layer_kept(width: int, heads: int, keys: int, queries: int, wide: int, statistics: int, size: int) -> int:
-    """Bytes a token that autograd keeps of a frozen transformer layer; `size` is that of a computed value.
-
-    Two norms keep what they read and their statistics, in float32; attention its queries and its outcome, its keys and
-    values, and a sum a head; the wide part its factors.
-    """
-    return 2 * (width + statistics) * FLOAT32_BYTES + 2 * (queries + keys) * size + heads * FLOAT32_BYTES + wide * size
-
-
-def tower_kept(tower: VisionTransformer, frames: int, prompts: int, size: int) -> tuple[int, int]:
-    """Bytes that a forward pass in training keeps of a frozen tower, and its peak of temporary ones.
-
-    Args:
-        frames: Pictures at a time.
-        prompts: Tokens beside a picture's own at each layer.
-        size: Bytes of the value that linear layers compute in; below 4 it is autocast.
-    """
-    from open_clip.transformer import QuickGELU
-
-    blocks, width = layers(tower), tower.transformer.width
-    first: Any = blocks[0]
-    wide, tokens = int(first.mlp.c_fc.out_features), frames * (len(tower.positional_embedding) + prompts)
-    # x sigmoid(1.702 x) is a product: both factors are kept.
-    factors = 2 if isinstance(first.mlp.gelu, QuickGELU) else 1
-    layer = layer_kept(width, first.attn.num_heads, width, width, factors * wide, 2, size)
-    # Autocast makes copies of the frozen weights, and the derivatives keep them.
-    copies = size * sum(p.numel() for p in blocks.parameters() if p.ndim > 1) if size < FLOAT32_BYTES else 0
-    return tokens * (len(blocks) * layer + (width + 2) * FLOAT32_BYTES) + copies, 4 * tokens * wide * size
+def count(params: Params, shapes: Shapes) -> Iterator[Use]:
+    """The memory of each stage that runs a base model of known shapes; `finetune_encoder` with prompts alone."""
+    config, tower = params.encoder, shapes.tower
+    if tower is not None:
+        blocks: Any = layers(tower)
+        width, wide, depth = tower.transformer.width, blocks[0].mlp.c_fc.out_features, len(blocks)
+        tokens, weights = len(tower.positional_embedding) + config.prompts, 4 * parameters(tower)
+        if config.recipe in ("paper", "release"):
+            classes = sum(len(p.levels) for p in shapes.catalogue.properties)
+            hidden = features(params, tower) if config.recipe == "paper" else 512
+            trained = min(depth, config.prompt_layers or depth) * config.prompts * width
+            trained += (width + 1) * (width if config.recipe == "paper" else 512) + (hidden + 1) * classes
+            shown = params.frames.per_video * min(config.micro_batch_size or config.batch_size, config.batch_size)
+            size = BYTES[config.autocast]
+            # A layer keeps what its norms read, in float32, attention's four, and both factors of the activation.
+            layer = 2 * width * 4 + (4 * width + 2 * wide) * size
+            # Autocast makes copies of the frozen weights, and the derivatives keep them.
+            copies = size * parameters(blocks) if size < 4 else 0
+            activations = shown * tokens * (depth * layer + 4 * wide * size) + copies
+            yield Use("finetune_encoder", 1, weights + 4 * trained, ADAM * trained, activations)
+        yield Use("embed", 1, weights, 0, 4 * config.embed_batch_size * tokens * wide * 4)
+    if shapes.llm is not None:
+        yield from language_uses(params, shapes.llm, shapes)
 
 
-def language_uses(params: Params, llm: PreTrainedModel, embedding: int, lengths: Lengths) -> Iterator[Use]:
-    """Alignment, LoRA and answering; `embedding` is the length of a tactile one."""
-    language = params.language
-    hidden, maps, blocks = llm.config.hidden_size, linear(llm), len(layers(llm))
-    size, middle = BYTES[language.dtype], maps["down_proj"][0]
+def language_uses(params: Params, llm: PreTrainedModel, shapes: Shapes) -> Iterator[Use]:
+    """Alignment, LoRA and answering."""
+    language, (longest, learnt) = params.language, shapes.longest
+    hidden, vocabulary, maps, blocks = llm.config.hidden_size, llm.config.vocab_size, linear(llm), len(layers(llm))
+    size, middle, (_, keys) = BYTES[language.dtype], maps["down_proj"][0], maps["k_proj"]
     held = NF4 if language.quantization == "nf4" else size
     # Linear maps alone are held in four bits.
-    layer = sum(a * b for a, b in maps.values())
-    frozen = blocks * layer * held + (parameters(llm) - blocks * layer) * size
-    connector, words, adapters = trained_parameters(params, llm, embedding)
+    mapped, outside = sum(a * b for a, b in maps.values()), parameters(llm) - parameters(layers(llm))
+    frozen = blocks * mapped * held + (parameters(llm) - blocks * mapped) * size
+    connector, words, adapters = trained_parameters(params, llm, shapes.embedding)
     devices, sharded = launched(params.runtime.launcher)
     shards = devices if sharded else 1
-    outside = parameters(llm) - parameters(layers(llm))
-    gathered = GATHERED * layer * held + outside * size + FLOAT32_BYTES * (connector + words) if shards > 1 else 0.0
-    all_trained = connector + words + adapters
-    for stage, config, trained in (("align", params.align, connector + words), ("lora", params.lora, all_trained)):
+    # A sharded training holds two layers whole: the one that computes and the one that is fetched.
+    gathered = 2 * mapped * held + outside * size + 4 * (connector + words) if shards > 1 else 0.0
+    every = connector + words + adapters
+    for stage, config, trained in (("align", params.align, connector + words), ("lora", params.lora, every)):
+        tokens, logits = config.micro_batch_size * longest, config.micro_batch_size * learnt * vocabulary * 4
+        # A layer keeps what its norms read, in float32, attention's four, and three of its middle; for each adapter
+        # what it reads in float32, and in a byte whether that was dropped.
+        layer = 2 * hidden * 4 + (2 * (maps["q_proj"][1] + keys) + 3 * middle) * size
+        if stage == "lora":
+            layer += sum(5 * maps[name][0] for name in adapted(params, llm))
+        # With checkpointing, of each layer what it reads is kept; one at a time is computed again.
+        stay = blocks * hidden * size + layer if params.runtime.gradient_checkpointing else blocks * layer
         # What comes and goes at the widest place: the logits and their gradient, or three of a layer's middle.
-        tokens, logits = config.micro_batch_size * lengths.training, config.micro_batch_size * lengths.answer
-        passing = max(2 * logits * llm.config.vocab_size * FLOAT32_BYTES, 3 * tokens * middle * size)
+        activations = tokens * stay + logits + max(2 * logits, 3 * tokens * middle * size)
         yield Use(
             stage,
             devices,
-            parameters=(frozen + FLOAT32_BYTES * trained) / shards + gathered,
+            parameters=(frozen + 4 * trained) / shards + gathered,
             # Gradients are shared among devices at the end of an update; until then each adds up its own.
-            optimizer=FLOAT32_BYTES * trained + (ADAM - FLOAT32_BYTES) * trained / shards,
+            optimizer=4 * trained + (ADAM - 4) * trained / shards,
             # The newest gradient of all words, when what the layers kept is gone.
-            activations=max(language_kept(params, llm, config, lengths) + passing, FLOAT32_BYTES * words),
+            activations=max(activations, 4 * words),
         )
     rows = language.generation_batch_size
-    yield Use(
-        "answer",
-        1,
-        parameters=frozen + FLOAT32_BYTES * all_trained,
-        optimizer=0,
-        # The prompts are read at once: the widest maps' outcomes, and a mask for each pair of tokens.
-        activations=rows * lengths.prompt * (3 * middle + 2 * hidden + lengths.prompt) * size,
-        cache=2 * rows * (lengths.prompt + language.max_new_tokens) * blocks * maps["k_proj"][1] * size,
-    )
+    # The prompts are read at once: the widest maps' outcomes, and a mask for each pair of tokens.
+    passing = rows * longest * (3 * middle + 2 * hidden + longest) * size
+    cache = 2 * rows * (longest + language.max_new_tokens) * blocks * keys * size
+    yield Use("answer", 1, frozen + 4 * every, 0, passing, cache)
 
 
 def trained_parameters(params: Params, llm: PreTrainedModel, embedding: int) -> tuple[int, int, int]:
@@ -229,36 +172,16 @@ def trained_parameters(params: Params, llm: PreTrainedModel, embedding: int) -> 
 
     Words are a copy beside the frozen ones, which a tied head still needs.
     """
-    hidden = llm.config.hidden_size
+    hidden, maps = llm.config.hidden_size, linear(llm)
     connector = (embedding + 1) * hidden + (hidden + 1) * hidden + 2 * hidden
     words = llm.config.vocab_size * hidden if params.align.train_embeddings == "all" else 0
-    return connector, words, len(layers(llm)) * params.lora.rank * sum(map(sum, adapted(llm, params.lora).values()))
+    return connector, words, len(layers(llm)) * params.lora.rank * sum(sum(maps[n]) for n in adapted(params, llm))
 
 
-def adapted(llm: PreTrainedModel, config: LoraTrainConfig) -> dict[str, tuple[int, int]]:
-    """Lengths of what goes in and comes out of the linear maps of a layer that get an adapter."""
-    targets = config.target_modules
-    return {name: ends for name, ends in linear(llm).items() if targets == "all-linear" or name in targets}
-
-
-def language_kept(params: Params, llm: PreTrainedModel, config: TrainConfig, lengths: Lengths) -> int:
-    """Bytes that a training's forward keeps: a batch of the longest conversations."""
-    size, tokens = BYTES[params.language.dtype], config.micro_batch_size * lengths.training
-    hidden, maps, blocks = llm.config.hidden_size, linear(llm), len(layers(llm))
-    queries, keys, middle = maps["q_proj"][1], maps["k_proj"][1], maps["down_proj"][0]
-    layer = layer_kept(hidden, llm.config.num_attention_heads, keys, queries, 3 * middle, 1, size)
-    if isinstance(config, LoraTrainConfig):
-        own = adapted(llm, config)
-        # Each map casts or drops what it reads for itself; a GPU remembers in a byte whether a value was dropped.
-        read = sum(ends[0] for ends in own.values()) * (FLOAT32_BYTES + (config.dropout > 0))
-        if size == FLOAT32_BYTES and not config.dropout:
-            read = FLOAT32_BYTES * sum(maps[min(each)][0] for each in READ_TOGETHER if each & own.keys())
-        layer += len(own) * config.rank * FLOAT32_BYTES + read
-    # With checkpointing, of each layer what it reads is kept; one at a time is computed again.
-    each = blocks * hidden * size + layer if params.runtime.gradient_checkpointing else blocks * layer
-    # The last norm, and logarithms of all words' probabilities.
-    loss = config.micro_batch_size * lengths.answer * llm.config.vocab_size * FLOAT32_BYTES
-    return int(tokens * (each + (hidden + 1) * FLOAT32_BYTES) + loss)
+def adapted(params: Params, llm: PreTrainedModel) -> list[str]:
+    """The linear maps of a layer that get an adapter."""
+    targets = params.lora.target_modules
+    return [name for name in linear(llm) if targets == "all-linear" or name in targets]
 
 
 def launched(launcher: str) -> tuple[int, bool]:
@@ -279,38 +202,33 @@ def launched(launcher: str) -> tuple[int, bool]:
         ) from None
 
 
-def longest(params: Params, catalogue: Catalogue, language: Path) -> Lengths:
-    """Look for the longest conversations among questions on all objects, in tokens of the folder's language model."""
+def longest(params: Params, catalogue: Catalogue, language: Path) -> tuple[int, int]:
+    """Look for the longest conversation among questions on all objects: its tokens, and those of them that are learnt.
+
+    Tokens are the folder's language model's, where its tokenizer is there.
+    """
     tokenizer = read_tokenizer(language) if (language / TOKENIZER).is_file() else None
-    config, rows = params.questions, {Part.TRAIN: list[tuple[int, int]](), Part.TEST: list[tuple[int, int]]()}
 
     def tokens(text: str) -> int:
         return len(tokenizer.encode(text).ids) if tokenizer else -(-len(text) // LETTERS)
 
-    for part, found in rows.items():
-        wanted = counts_by_task(config, "train" if part == Part.TRAIN else "evaluation")
-        questions = build_questions(
-            Pool(part, catalogue, {o: [f"{o}_0"] for o in catalogue.objects}),
-            {task: min(number, ASKED) for task, number in wanted.items()},
-            seed=config.seed,
-            distinct=False,
-            facts=config.facts,
-            restate=config.restate,
-            two_turns=config.two_turns if part == Part.TRAIN else 0.0,
-        )
-        for question, turns in ((q, d.turns) for q in questions for d in q.dialogues if d.opd in params.ablation.opd):
-            said = [t.assistant for t in turns]
-            if part == Part.TEST:
-                said[-1] = ""  # What is asked for.
-            shown = [f"USER: {t.user} ASSISTANT: {answer}" for t, answer in zip(turns, said, strict=True)]
-            text = " ".join([params.language.system_prompt, *shown]).replace("{tactile}", "")
-            # A video is its frames and two delimiters.
-            length = tokens(text) + len(question.videos) * (params.frames.per_video + 2)
-            found.append((length, sum(tokens(answer) + 1 for answer in said)))
-    training, prompts = rows[Part.TRAIN], [length for length, _ in rows[Part.TEST]]
-    columns = ([length for length, _ in training], [learnt for _, learnt in training], prompts)
-    means = (sum(numbers) / max(1, len(numbers)) for numbers in columns)
-    return Lengths(*max(training, default=(0, 0)), max(prompts, default=0), *means)
+    config, found = params.questions, [(0, 0)]
+    questions = build_questions(
+        Pool(Part.TRAIN, catalogue, {o: [f"{o}_0"] for o in catalogue.objects}),
+        {t: min(n, ASKED) for part in ("train", "evaluation") for t, n in counts_by_task(config, part).items() if n},
+        seed=config.seed,
+        distinct=False,
+        facts=config.facts,
+        restate=config.restate,
+        two_turns=config.two_turns,
+    )
+    for question, turns in ((q, d.turns) for q in questions for d in q.dialogues if d.opd in params.ablation.opd):
+        shown = [f"USER: {turn.user} ASSISTANT: {turn.assistant}" for turn in turns]
+        text = " ".join([params.language.system_prompt, *shown]).replace("{tactile}", "")
+        # A video is its frames and two delimiters.
+        length = tokens(text) + len(question.videos) * (params.frames.per_video + 2)
+        found.append((length, sum(tokens(turn.assistant) + 1 for turn in turns)))
+    return max(found)
 
 
 def table(uses: Sequence[Use]) -> str:
