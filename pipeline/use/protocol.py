@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import base64
+import re
 import time
 import uuid
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
-from pydantic import AliasChoices, BaseModel, Field, ValidationError, field_validator
+from pydantic import AliasChoices, BaseModel, BeforeValidator, Field, ValidationError, field_validator
 
-from pipeline.core.errors import first_problem
+from pipeline.core.errors import UserError, first_problem
 from pipeline.language.chat import TACTILE
-from pipeline.use.media import Refused, from_base64
 
+DATA_URI = re.compile(r"data:[\w.+/-]*(?:;[\w.+/=-]+)*;base64,", re.ASCII)
 MESSAGES, CHARACTERS = 64, 20_000
 """The longest conversation, and the longest text of one part of it."""
 Json = dict[str, Any]
@@ -20,8 +22,19 @@ Said = tuple[str, tuple[bytes, ...], str]
 """A question, its videos, and the answer."""
 
 
+def from_base64(value: object) -> bytes:
+    """Bytes of base64 or of a `data:...;base64,` URI; ValueError for all else: no path or address here can be read."""
+    text = str(value)
+    # A path has at most 4096 characters; the pattern is not searched through megabytes.
+    head = DATA_URI.match(text, 0, 4096)
+    try:
+        return base64.b64decode(text[head.end() :] if head else text, validate=True)
+    except ValueError:
+        raise ValueError("broken base64; send the file's bytes as data:video/mp4;base64,... in one line") from None
+
+
 class _Url(BaseModel):
-    url: str
+    url: Annotated[bytes, BeforeValidator(from_base64), Field(min_length=1)]
 
 
 class _Text(BaseModel):
@@ -38,7 +51,7 @@ class Message(BaseModel):
     """One turn."""
 
     role: Literal["system", "developer", "user", "assistant"]
-    content: list[Annotated[_Text | _Touch, Field(discriminator="type")]] = Field(min_length=1, max_length=MESSAGES)
+    content: list[Annotated[_Text | _Touch, Field(discriminator="type")]] = Field(min_length=1)
 
     @field_validator("content", mode="before")
     @classmethod
@@ -54,25 +67,24 @@ class ChatRequest(BaseModel):
     """
 
     model: str = Field(max_length=200)
-    messages: Annotated[list[Message], Field(min_length=1, max_length=MESSAGES)]
+    messages: list[Message] = Field(max_length=MESSAGES)
     stream: bool | None = None
     max_tokens: int | None = Field(default=None, ge=1)
     max_completion_tokens: int | None = Field(default=None, ge=1)
     n: Literal[1] | None = None
     stop: Annotated[list[str], Field(max_length=0)] | None = None
     tools: Annotated[list[Any], Field(max_length=0)] | None = None
-    functions: Annotated[list[Any], Field(max_length=0)] | None = None
     logprobs: Literal[False] | None = None
     response_format: dict[Literal["type"], Literal["text"]] | None = None
 
 
 def read_request(body: bytes) -> ChatRequest:
-    """Read a body; where it has not the form, it is Refused with the first place that is wrong."""
+    """Read a body; UserError with the first place that is wrong where it has not the form."""
     try:
         return ChatRequest.model_validate_json(body)
     except ValidationError as error:
         # Cut, since a message may quote what was sent.
-        raise Refused(first_problem(error)[:300]) from None
+        raise UserError(first_problem(error)[:300]) from None
 
 
 def read_conversation(messages: Sequence[Message]) -> list[Said]:
@@ -84,26 +96,25 @@ def read_conversation(messages: Sequence[Message]) -> list[Said]:
     System messages are left out: the model was trained under its own and knows no other.
 
     Raises:
-        Refused: where user and assistant do not take turns, the assistant sends a video, or one is no base64.
+        UserError: where user and assistant do not take turns, or the assistant sends a video.
     """
-    turns = [(i, m) for i, m in enumerate(messages) if m.role in ("user", "assistant")]
-    if len(turns) % 2 == 0 or any(m.role != ("user", "assistant")[place % 2] for place, (_, m) in enumerate(turns)):
-        raise Refused("messages: user and assistant must take turns, the user first and last")
+    turns = [m for m in messages if m.role in ("user", "assistant")]
+    if len(turns) % 2 == 0 or any(m.role != ("user", "assistant")[i % 2] for i, m in enumerate(turns)):
+        raise UserError("messages: user and assistant must take turns, the user first and last")
     said: list[Said] = []
-    for number, message in turns:
+    for message in turns:
+        videos = tuple(part.video_url.url for part in message.content if isinstance(part, _Touch))
         texts = [part.text for part in message.content if isinstance(part, _Text)]
         placed = sum(bool(text.strip()) for text in texts) == 1 or any(TACTILE in text for text in texts)
-        text, videos = "", []
-        for i, part in enumerate(message.content):
+        text = ""
+        for part in message.content:
             piece = part.text if isinstance(part, _Text) else "" if placed else TACTILE
-            if isinstance(part, _Touch):
-                videos.append(from_base64(part.video_url.url, f"messages.{number}.content.{i}"))
             apart = text and piece and not text[-1].isspace() and not piece[0].isspace()
             text += f" {piece}" if apart else piece
         if message.role == "user":
-            said.append((text, tuple(videos), ""))
+            said.append((text, videos, ""))
         elif videos:
-            raise Refused("messages: an assistant's message brings a video; only the user's may")
+            raise UserError("messages: an assistant's message brings a video; only the user's may")
         else:
             said[-1] = (*said[-1][:2], text)
     return said
@@ -130,10 +141,3 @@ class Reply:
         choice = {"index": 0, called: said, "logprobs": None, "finish_reason": finish}
         notes = {"notes": self.notes} if finish else {}
         return {**self.head, "object": "chat.completion.chunk", "choices": [choice], **notes}
-
-
-def error_body(message: str, status: int) -> Json:
-    """An error in OpenAI's form."""
-    kinds = {401: "authentication_error", 404: "not_found_error", 429: "rate_limit_error"}
-    kind = kinds.get(status, "server_error" if status >= 500 else "invalid_request_error")
-    return {"error": {"message": message, "type": kind, "param": None, "code": None}}

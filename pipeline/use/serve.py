@@ -9,36 +9,29 @@ from __future__ import annotations
 import asyncio
 import hmac
 import json
-import math
 import os
 import time
-from collections import Counter
-from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Iterable
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterable
 from contextlib import ExitStack, aclosing, asynccontextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fastapi import APIRouter, Depends, FastAPI, Request
-from fastapi.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
+from fastapi import Depends, FastAPI, Request
+from fastapi.responses import JSONResponse, Response, StreamingResponse
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from pipeline.core.errors import UserError
-from pipeline.use.media import PLACE, Gate, Limits, Refused
-from pipeline.use.protocol import ChatRequest, Json, Reply, error_body, read_conversation, read_request
+from pipeline.use.media import PLACE, Gate
+from pipeline.use.protocol import ChatRequest, Json, Reply, read_conversation, read_request
 from pipeline.use.results import Exchange
 from pipeline.use.server import Failed, Worker, listen, make_server
 
 if TYPE_CHECKING:
     from pipeline.use.model import Octopi
 
-UPLOAD_SECONDS, DRAIN_SECONDS, LOOK_SECONDS = 30.0, 5.0, 0.1
-"""Time that a client may take to send a body, and to send the rest of a refused one; and the interval of checks whether
-the client is still connected."""
-MOST_TOKENS = 1024
-"""The longest answer that a client may ask for."""
-SHORTEST_TOKEN = 16
+MOST_BYTES, MOST_TOKENS, SHORTEST_TOKEN = 32 * 2**20, 1024, 16
+"""The largest request, the longest answer that a client may ask for, and the fewest characters of a server's token."""
 LOCAL_NAMES = ("127.0.0.1", "localhost", "::1", "[::1]")
 """Names that a server without a token answers to."""
 
@@ -61,139 +54,28 @@ def serve(load: Callable[[], Octopi], name: str, host: str, port: int, token_fil
 
 
 def read_token(file: Path | None) -> str:
-    """The token that the file holds, or else the environment; UserError for an empty file or a short token."""
-    if file is None:
-        token = os.environ.get("OCTOPI_TOKEN", "").strip()
-    else:
-        try:
-            token = file.read_text(encoding="utf-8").strip()
-        except (OSError, UnicodeDecodeError) as error:
-            raise UserError(f"--token-file {file}: cannot be read ({error}); name a text file") from None
-        if not token:
-            raise UserError(f"--token-file {file}: empty; write the token into it")
-    if token and (len(token) < SHORTEST_TOKEN or not token.isascii() or not token.isprintable()):
-        raise UserError(f"the token needs {SHORTEST_TOKEN} or more ASCII characters; `openssl rand -hex 32` makes one")
+    """The token that the file holds, or else the environment; UserError for one that is short or cannot be read."""
+    try:
+        token = (file.read_text(encoding="utf-8") if file else os.environ.get("OCTOPI_TOKEN", "")).strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"--token-file {file}: cannot be read ({error}); name a text file") from None
+    if (token or file) and (len(token) < SHORTEST_TOKEN or not token.isascii() or not token.isprintable()):
+        place = f"--token-file {file}" if file else "OCTOPI_TOKEN"
+        raise UserError(f"{place}: needs {SHORTEST_TOKEN} or more ASCII characters; `openssl rand -hex 32` makes some")
     return token
 
 
-class Service:
-    """What the routes share."""
-
-    def __init__(self, model: Octopi, name: str, *, token: str, limits: Limits | None, places: int) -> None:
-        self.model, self.name, self.token, self.places = model, name, token, places
-        self.gate, self.worker = Gate(limits), Worker()
-        self.taken: set[Reply] = set()
-        """The places: a reply each to a request that is read, checked, waiting or answered."""
-        self.requests: Counter[int] = Counter()
-        self.videos = 0
-
-    async def check_token(self, request: Request) -> None:
-        """Raise 401 without the right token, or 403 where the server has none and is called by another machine's name.
-
-        A site may point its own name at 127.0.0.1, so that a visitor's browser asks here for it (DNS rebinding).
-        """
-        if not self.token:
-            if (request.url.hostname or "") not in LOCAL_NAMES:
-                raise HTTPException(403, "this server has no token and answers to 127.0.0.1 and localhost only")
-            return
-        given = request.headers.get("authorization", "").removeprefix("Bearer ").strip()
-        if not hmac.compare_digest(given.encode("utf-8", "replace"), self.token.encode()):
-            raise HTTPException(
-                401, "wrong or no token; send Authorization: Bearer TOKEN", {"WWW-Authenticate": "Bearer"}
-            )
-
-    def check_name(self, name: str) -> None:
-        """Raise 404 for another model's name."""
-        if name != self.name:
-            raise HTTPException(404, f"model {name[:80]!r} is not served here; ask for {self.name!r}")
-
-    async def chat(self, request: Request) -> Response:
-        """Answer `/v1/chat/completions`."""
-        if len(self.taken) >= self.places:
-            mean = self.worker.seconds / self.worker.answers if self.worker.answers else 1.0
-            wait = str(min(600, max(1, math.ceil(mean * len(self.taken)))))
-            message = f"all {self.places} places are taken; come again in {wait} s"
-            raise HTTPException(429, message, {"Retry-After": wait})
-        reply = Reply(self.name)
-        with ExitStack() as stack:
-            self.taken.add(reply)
-            stack.callback(self.taken.remove, reply)
-            wanted, exchanges = await asyncio.to_thread(self._prepare, await self._read(request), stack)
-            # From here on the worker gives the place back, when it needs the files no more.
-            pieces = self.worker.answer(lambda: self._ask(wanted, exchanges, reply), stack.pop_all().close)
-        self.videos += sum(len(exchange.videos) for exchange in exchanges)
-        if wanted.stream:
-            first = await _unless_left(request, anext(pieces, ""))
-            return StreamingResponse(_events(reply, first, pieces), media_type="text/event-stream")
-        return JSONResponse(reply.whole(await _unless_left(request, _join(pieces))))
-
-    async def _read(self, request: Request) -> bytes:
-        """The body, of limited size and time."""
-        if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
-            # A page of another site may send other types without asking the browser's leave.
-            raise HTTPException(415, "send Content-Type: application/json")
-        data, most = bytearray(), self.gate.limits.body_bytes
-        try:
-            async with asyncio.timeout(UPLOAD_SECONDS):
-                async for chunk in request.stream():
-                    data += chunk
-                    if len(data) > most:
-                        message = f"the request is larger than {most} bytes; send fewer or shorter videos"
-                        raise HTTPException(413, message)
-        except TimeoutError:
-            message = f"the request took longer than {UPLOAD_SECONDS:g} s to arrive"
-            raise HTTPException(408, message, {"Connection": "close"}) from None
-        return bytes(data)
-
-    def _prepare(self, body: bytes, stack: ExitStack) -> tuple[ChatRequest, list[Exchange]]:
-        """The request and its conversation, whose videos are files until the stack is closed."""
-        wanted = read_request(body)
-        self.check_name(wanted.model)
-        said = read_conversation(wanted.messages)
-        files = iter(stack.enter_context(self.gate.files([video for _, videos, _ in said for video in videos])))
-        return wanted, [Exchange(q, tuple(next(files) for _ in videos), a) for q, videos, a in said]
-
-    def _ask(self, wanted: ChatRequest, exchanges: list[Exchange], reply: Reply) -> Iterable[str]:
-        """The answer in pieces, made in the model's thread; its notes go into the reply."""
-        *history, last = exchanges
-        most = wanted.max_completion_tokens or wanted.max_tokens
-        most = min(most, MOST_TOKENS) if most else None
-        pieces = self.model.stream(last.question, last.videos, history=history, max_new_tokens=most)
-        notes = self.model.notes([video for exchange in exchanges for video in exchange.videos], last.question)
-        reply.notes = [PLACE.sub(r"video \1", note) for note in notes]
-        return pieces
-
-    def metrics(self) -> str:
-        """What happened since the start, in Prometheus' text format."""
-        by_status = "".join(f'octopi_requests_total{{status="{s}"}} {n}\n' for s, n in sorted(self.requests.items()))
-        return f"""# TYPE octopi_requests_total counter
-{by_status}# TYPE octopi_videos_total counter
-octopi_videos_total {self.videos}
-# TYPE octopi_requests_waiting gauge
-octopi_requests_waiting {len(self.taken)}
-# TYPE octopi_requests_places gauge
-octopi_requests_places {self.places}
-# TYPE octopi_answer_seconds summary
-octopi_answer_seconds_sum {self.worker.seconds:.6f}
-octopi_answer_seconds_count {self.worker.answers}
-"""
-
-
-async def _unless_left(request: Request, work: Awaitable[str]) -> str:
-    """The result of `work`, which is given up when the client hangs up."""
-    task = asyncio.ensure_future(work)
-    try:
-        while not task.done():
-            if await request.is_disconnected():
-                raise ClientDisconnect
-            await asyncio.wait([task], timeout=LOOK_SECONDS)
-        return task.result()
-    finally:
-        task.cancel()
-
-
-async def _join(pieces: AsyncIterator[str]) -> str:
-    return "".join([piece async for piece in pieces])
+async def _read(request: Request, most: int) -> bytes:
+    """The body of at most so many bytes."""
+    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
+        # A page of another site may send other types without asking the browser's leave.
+        raise HTTPException(415, "send Content-Type: application/json")
+    data = bytearray()
+    async for chunk in request.stream():
+        data += chunk
+        if len(data) > most:
+            raise HTTPException(413, f"the request is larger than {most} bytes; send fewer or shorter videos")
+    return bytes(data)
 
 
 async def _events(reply: Reply, first: str, pieces: AsyncGenerator[str]) -> AsyncIterator[str]:
@@ -211,96 +93,125 @@ async def _events(reply: Reply, first: str, pieces: AsyncGenerator[str]) -> Asyn
             yield event(reply.chunk({}, "stop"))
             yield "data: [DONE]\n\n"
         except (UserError, Failed) as error:
-            yield event(error_body(*_client_message(error)))
+            yield event(_error(error)[0])
 
 
-def _client_message(error: Exception) -> tuple[str, int]:
-    """What a client is told of an error, and the status."""
+def _error(error: Exception) -> tuple[Json, int]:
+    """An error in OpenAI's form, of one line, and its status."""
     if isinstance(error, HTTPException):
-        return str(error.detail), error.status_code
-    status = error.status if isinstance(error, Refused) else 422 if isinstance(error, UserError) else 500
+        message, status = str(error.detail), error.status_code
+    elif isinstance(error, UserError):
+        message, status = str(error), 422
+    else:
+        message, status = str(Failed()), 500
+    kinds = {401: "authentication_error", 404: "not_found_error", 429: "rate_limit_error", 500: "server_error"}
     # Videos lie in a folder of ours, whose name is nobody's business.
-    return PLACE.sub(r"video \1", " ".join(str(error).split())), status
+    message = PLACE.sub(r"video \1", " ".join(message.split()))
+    told = {"message": message, "type": kinds.get(status, "invalid_request_error"), "param": None, "code": None}
+    return {"error": told}, status
 
 
-def make_app(model: Octopi, name: str, *, token: str = "", limits: Limits | None = None, places: int = 32) -> FastAPI:
+def make_app(model: Octopi, name: str, *, token: str = "", places: int = 32, most_bytes: int = MOST_BYTES) -> FastAPI:
     """The web application.
 
     Args:
         model: Asked by one thread only.
         name: What clients call it.
         token: What they must send; empty for none, and then only names of this machine are answered to.
-        limits: Of one request.
         places: Requests at once, from the first byte to the answer; the next gets 429.
+        most_bytes: Size of a request as sent, base64 included.
     """
-    service = Service(model, name, token=token, limits=limits, places=places)
+    gate, worker = Gate(), Worker()
+    taken: set[Reply] = set()  # The places.
     entry = {"id": name, "object": "model", "created": int(time.time()), "owned_by": "octopi-pipeline"}
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         yield
-        await asyncio.to_thread(service.worker.stop)
-        service.gate.close()
+        await asyncio.to_thread(worker.stop)
+        gate.close()
+
+    async def check_token(request: Request) -> None:
+        given = request.headers.get("authorization", "")
+        if token and not hmac.compare_digest(given.encode("utf-8", "replace"), f"Bearer {token}".encode()):
+            message = "wrong or no token; send Authorization: Bearer TOKEN"
+            raise HTTPException(401, message, {"WWW-Authenticate": "Bearer"})
+        # A site may point its own name here, so that a visitor's browser asks for it (DNS rebinding).
+        if not token and request.url.hostname not in LOCAL_NAMES:
+            raise HTTPException(403, "this server has no token and answers to 127.0.0.1 and localhost only")
+
+    def check_name(wanted: str) -> None:
+        if wanted != name:
+            raise HTTPException(404, f"model {wanted[:80]!r} is not served here; ask for {name!r}")
+
+    def prepare(body: bytes, stack: ExitStack) -> tuple[ChatRequest, list[Exchange]]:
+        """The request and its conversation, whose videos are files until the stack is closed."""
+        wanted = read_request(body)
+        check_name(wanted.model)
+        said = read_conversation(wanted.messages)
+        files = iter(stack.enter_context(gate.files([video for _, videos, _ in said for video in videos])))
+        return wanted, [Exchange(q, tuple(next(files) for _ in videos), a) for q, videos, a in said]
+
+    def ask(wanted: ChatRequest, exchanges: list[Exchange], reply: Reply) -> Iterable[str]:
+        """The answer in pieces, made in the model's thread; its notes go into the reply."""
+        *history, last = exchanges
+        most = wanted.max_completion_tokens or wanted.max_tokens
+        most = min(most, MOST_TOKENS) if most else None
+        pieces = model.stream(last.question, last.videos, history=history, max_new_tokens=most)
+        notes = model.notes([video for exchange in exchanges for video in exchange.videos], last.question)
+        reply.notes = [PLACE.sub(r"video \1", note) for note in notes]
+        return pieces
 
     app = FastAPI(title="octopi serve", lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
-    guarded = APIRouter(dependencies=[Depends(service.check_token)])
-    guarded.post("/v1/chat/completions")(service.chat)
+    guarded = [Depends(check_token)]
 
-    @guarded.get("/v1/models")
+    @app.post("/v1/chat/completions", dependencies=guarded)
+    async def chat(request: Request) -> Response:
+        if len(taken) >= places:
+            raise HTTPException(429, f"all {places} places are taken; come again soon")
+        reply = Reply(name)
+        with ExitStack() as stack:
+            taken.add(reply)
+            stack.callback(taken.remove, reply)
+            body = await _read(request, most_bytes)
+            wanted, exchanges = await asyncio.to_thread(prepare, body, stack)
+            # From here on the worker gives the place back, when it needs the files no more.
+            pieces = worker.answer(lambda: ask(wanted, exchanges, reply), stack.pop_all().close)
+        if wanted.stream:
+            # What fails before the first piece has a status of its own.
+            first = await anext(pieces, "")
+            return StreamingResponse(_events(reply, first, pieces), media_type="text/event-stream")
+        text = ""
+        async with aclosing(pieces):
+            async for piece in pieces:
+                text += piece
+                if await request.is_disconnected():
+                    raise ClientDisconnect
+        return JSONResponse(reply.whole(text))
+
+    @app.get("/v1/models", dependencies=guarded)
     async def models() -> Json:
         return {"object": "list", "data": [entry]}
 
-    @guarded.get("/v1/models/{wanted:path}")
+    @app.get("/v1/models/{wanted:path}", dependencies=guarded)
     async def one_model(wanted: str) -> Json:
-        service.check_name(wanted)
+        check_name(wanted)
         return entry
-
-    @guarded.get("/metrics")
-    async def metrics() -> Response:
-        return PlainTextResponse(service.metrics(), media_type="text/plain; version=0.0.4")
 
     @app.get("/health")
     async def health() -> Json:
-        return {"status": "ok", "model": name, "waiting": len(service.taken), "places": places}
-
-    @app.exception_handler(HTTPException)
-    @app.exception_handler(UserError)
-    @app.exception_handler(Failed)
-    async def refuse(request: Request, error: Exception) -> Response:
-        message, status = _client_message(error)
-        if status != 408:
-            # The rest of the body is read: a client that is still sending would not see the answer.
-            rest = 4 * service.gate.limits.body_bytes
-            with suppress(Exception):
-                async with asyncio.timeout(DRAIN_SECONDS):
-                    async for chunk in request.stream():
-                        rest -= len(chunk)
-                        if rest < 0:
-                            break
-        return JSONResponse(error_body(message, status), status, getattr(error, "headers", None))
+        return {"status": "ok", "model": name, "waiting": len(taken), "places": places}
 
     @app.exception_handler(ClientDisconnect)
     async def left(_: Request, __: Exception) -> Response:
         return Response(status_code=499)  # As nginx numbers it; nobody reads it.
 
+    @app.exception_handler(HTTPException)
+    @app.exception_handler(UserError)
+    @app.exception_handler(Failed)
     @app.exception_handler(Exception)
-    async def fail(_: Request, __: Exception) -> Response:
-        service.requests[500] += 1  # What nothing foresaw is answered outside of `count`.
-        return JSONResponse(error_body(str(Failed()), 500), 500)
+    async def refuse(_: Request, error: Exception) -> Response:
+        content, status = _error(error)
+        return JSONResponse(content, status, getattr(error, "headers", None))
 
-    def count(inner: ASGIApp) -> ASGIApp:
-        """Count answers by status. No `@app.middleware`, behind which a stream never learns that its client left."""
-
-        async def counted(scope: Scope, receive: Receive, send: Send) -> None:
-            async def sent(message: Message) -> None:
-                if message["type"] == "http.response.start":
-                    service.requests[message["status"]] += 1
-                await send(message)
-
-            await inner(scope, receive, sent)
-
-        return counted
-
-    app.include_router(guarded)
-    app.add_middleware(count)
     return app

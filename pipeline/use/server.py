@@ -9,23 +9,17 @@ import logging
 import queue
 import socket
 import threading
-import time
 from collections.abc import AsyncGenerator, Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any
 
-import h11
 import uvicorn
 from fastapi import FastAPI
-from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from pipeline.core.errors import UserError
 
 logger = logging.getLogger(__name__)
 
-HEADER_SECONDS = 10.0
-"""How long a client may take for a request's head."""
 TOGETHER = 32
 """Most questions that are begun at once; the model divides them by its own batch size."""
 PAUSE = 0.05
@@ -40,14 +34,17 @@ class Failed(Exception):
         super().__init__("the model failed at this request; the server's log says why")
 
 
-@dataclass(frozen=True)
 class Job:
-    """A question on its way: the arguments of `Worker.answer`, where pieces go, and whether nobody waits for them."""
+    """A question on its way to the model's thread, and the pieces of its answer on their way back."""
 
-    ask: Callable[[], Iterable[Any]]
-    done: Callable[[], object]
-    put: Callable[[Any], None]
-    left: threading.Event
+    def __init__(self, ask: Callable[[], Iterable[Any]], done: Callable[[], object]) -> None:
+        self.ask, self.left, self._done = ask, False, done
+        self._loop, self._pieces = asyncio.get_running_loop(), asyncio.Queue[Any]()
+
+    def put(self, piece: Any) -> None:
+        """Send a piece; an error is raised there, and None is the end."""
+        with suppress(RuntimeError):  # The loop is closed: nobody waits.
+            self._loop.call_soon_threadsafe(self._pieces.put_nowait, piece)
 
     def end(self, error: Exception | None = None) -> None:
         """Give the place and the files back first, so that who has the answer finds the place free."""
@@ -55,20 +52,24 @@ class Job:
             logger.error("the model failed", exc_info=error)
             error = Failed()
         with suppress(Exception):
-            self.done()
+            self._done()
         self.put(error)
+
+    async def pieces(self) -> AsyncGenerator[Any]:
+        """What was put; `left` is set where nobody takes it any more."""
+        try:
+            while (piece := await self._pieces.get()) is not None:
+                if isinstance(piece, Exception):
+                    raise piece
+                yield piece
+        finally:
+            self.left = True
 
 
 class Worker:
-    """The thread that holds the model: what waits is answered in one batch, and what comes meanwhile in the next.
-
-    Attributes:
-        answers: How many were given in full.
-        seconds: Total time that the model took for them.
-    """
+    """The thread that holds the model: what waits is answered in one batch, and what comes meanwhile in the next."""
 
     def __init__(self) -> None:
-        self.answers, self.seconds = 0, 0.0
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
         # A daemon, so that a second Ctrl-C does not wait for the answer.
         self._thread = threading.Thread(target=self._work, name="octopi-model", daemon=True)
@@ -88,25 +89,10 @@ class Worker:
             UserError: as `ask` raises it.
             Failed: where it raises anything else.
         """
-        loop, left = asyncio.get_running_loop(), threading.Event()
-        pieces: asyncio.Queue[Any] = asyncio.Queue()
-
-        def put(piece: Any) -> None:
-            with suppress(RuntimeError):  # The loop is closed: nobody waits.
-                loop.call_soon_threadsafe(pieces.put_nowait, piece)
-
-        async def made() -> AsyncGenerator[Any]:
-            try:
-                while (piece := await pieces.get()) is not None:
-                    if isinstance(piece, Exception):
-                        raise piece
-                    yield piece
-            finally:
-                left.set()
-
+        job = Job(ask, done)
         # Queued here and not at the first piece: `done` is called even where nobody asks for a piece.
-        self._jobs.put(Job(ask, done, put, left))
-        return made()
+        self._jobs.put(job)
+        return job.pieces()
 
     def stop(self) -> None:
         """Wait until all that is queued is answered."""
@@ -122,19 +108,14 @@ class Worker:
                         self._jobs.put(None)  # It ends the loop when these are answered.
                         break
                     jobs.append(job)
-            started = time.monotonic()
             self._answer(jobs)
-            self.seconds += time.monotonic() - started
 
     def _answer(self, jobs: Sequence[Job]) -> None:
         """Answer what cannot be in a batch by itself, then the others in one."""
         batch: list[tuple[Job, Any]] = []
         for job in jobs:
-            if job.left.is_set():
-                job.end()
-                continue
             try:
-                pieces = job.ask()
+                pieces = () if job.left else job.ask()
             except Exception as error:
                 job.end(error)
                 continue
@@ -155,9 +136,8 @@ class Worker:
                 if piece is not None and place in waiting:
                     waiting[place].put(piece)
                 elif place in waiting:
-                    self.answers += 1
                     waiting.pop(place).end()
-                for gone in [place for place, job in waiting.items() if job.left.is_set()]:
+                for gone in [place for place, job in waiting.items() if job.left]:
                     left.add(gone)
                     waiting.pop(gone).end()
                 if not waiting:
@@ -167,32 +147,11 @@ class Worker:
                 job.end(error)
 
 
-class HeaderTimeout(H11Protocol):
-    """Closes the connection of a client that does not send a request's head in time; uvicorn waits without end."""
-
-    _timer: asyncio.TimerHandle | None = None
-
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Start the clock."""
-        super().connection_made(transport)
-        self._timer = self.loop.call_later(HEADER_SECONDS, transport.close)
-
-    def data_received(self, data: bytes) -> None:
-        """Stop it when a request is there; start it at the next one's first byte."""
-        super().data_received(data)
-        if self.conn.their_state is h11.IDLE:
-            self._timer = self._timer or self.loop.call_later(HEADER_SECONDS, self.transport.close)
-        elif self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
-
-
 def make_server(app: FastAPI) -> uvicorn.Server:
     """The server of the application; `run(sockets=[...])` returns when a signal came and all answers are sent."""
-    config = uvicorn.Config(
-        app, http=HeaderTimeout, ws="none", lifespan="on", access_log=False, log_level="warning", server_header=False
+    return uvicorn.Server(
+        uvicorn.Config(app, ws="none", lifespan="on", access_log=False, log_level="warning", server_header=False)
     )
-    return uvicorn.Server(config)
 
 
 def listen(host: str, port: int, token: str = "") -> socket.socket:

@@ -17,7 +17,6 @@ from openai.types import Model
 from openai.types.chat import ChatCompletion, ChatCompletionChunk
 from starlette.testclient import TestClient
 
-from pipeline.use.media import Limits
 from pipeline.use.model import Octopi
 from pipeline.use.serve import make_app, read_token
 from pipeline.use.server import listen
@@ -26,7 +25,6 @@ from tests.use.fake import CHAT, FakeOctopi, body, digest, events, part, said, t
 from tests.use.videos import video
 
 TOKEN = "0123456789abcdef"
-LIMITS = Limits(body_bytes=400_000, videos=3, frames=200)
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +34,7 @@ def fake() -> FakeOctopi:
 
 @pytest.fixture(scope="module")
 def client(fake: FakeOctopi) -> Iterator[TestClient]:
-    app = make_app(fake, "octopi", token=TOKEN, limits=LIMITS, places=2)
+    app = make_app(fake, "octopi", token=TOKEN, places=2, most_bytes=400_000)
     headers = {"Authorization": f"Bearer {TOKEN}"}
     with TestClient(app, headers=headers, raise_server_exceptions=False) as client:
         yield client
@@ -131,7 +129,7 @@ def test_a_conversation_and_what_is_let_through(client: TestClient, fake: FakeOc
 
 
 def test_who_is_let_in(client: TestClient, fake: FakeOctopi) -> None:
-    for path in ("/v1/models", "/v1/models/octopi", "/metrics", CHAT):
+    for path in ("/v1/models", "/v1/models/octopi", CHAT):
         for header in ("", "Bearer", "Bearer wrong", f"Basic {TOKEN}x", f"Bearer {TOKEN}x", "Bearer \xe9"):
             headers = {"Authorization": header.encode("latin-1")}
             response = client.request("POST" if path == CHAT else "GET", path, headers=headers)
@@ -171,9 +169,12 @@ BAD: list[tuple[bytes | dict[str, Any], int, str]] = [
     (body(ASK, logprobs=True), 422, "logprobs"),
     (body(ASK, response_format={"type": "json_object"}), 422, "response_format"),
     (body(ASK, max_tokens=0), 422, "max_tokens"),
-    (body(user({"type": "video_url", "video_url": {"url": "/etc/passwd"}})), 422, "content.0: broken base64"),
-    (body(user(part(b"no video at all"))), 422, "video 1: no video"),
-    (body(user(*[part(video())] * 4)), 413, "4 videos"),
+    (
+        body(user({"type": "video_url", "video_url": {"url": "/etc/passwd"}})),
+        422,
+        "url: broken base64",
+    ),
+    (body(user(part(b"no video at all"))), 422, "video 1: no frame"),
     (body(user("one {tactile} and no video")), 422, "{tactile}"),
     (body(user(text("blank"), part(video()))), 422, "video 1: 12 frames show no touch"),
 ]
@@ -220,33 +221,9 @@ def test_429_when_all_places_are_taken(client: TestClient, fake: FakeOctopi) -> 
             fake.gate.set()
     fake.gate = None
     assert "2 places" in error(response, 429)
-    assert 1 <= int(response.headers["retry-after"]) <= 600
     assert [a.result().status_code for a in waiting] == [200, 200]
     assert fake.asked == asked + 2
     assert client.post(CHAT, json=body(ASK)).status_code == 200
-
-
-def test_metrics_are_prometheus_text_and_count(client: TestClient) -> None:
-    def read() -> dict[str, float]:
-        response = client.get("/metrics")
-        assert response.headers["content-type"].startswith("text/plain; version=0.0.4")
-        lines = [line for line in response.text.splitlines() if not line.startswith("#")]
-        # prometheus.io/docs/instrumenting/exposition_formats: name, labels in braces, a number.
-        assert all(re.fullmatch(r'[a-z_]+(\{[a-z]+="[^"]*"\})? [0-9.]+', line) for line in lines)
-        return {name: float(value) for name, value in (line.rsplit(" ", 1) for line in lines)}
-
-    before = read()
-    client.post(CHAT, json=body(user(part(video(1)), part(video(2)))))
-    client.post(CHAT, json=[])
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipeline.use.serve.read_request", lambda _: 1 / 0)
-        assert client.post(CHAT, json=body(ASK)).status_code == 500
-    after = read()
-    grown = {name: after[name] - before.get(name, 0) for name in after}
-    assert grown['octopi_requests_total{status="422"}'] == grown["octopi_answer_seconds_count"] == 1
-    assert grown['octopi_requests_total{status="500"}'] == 1
-    assert grown["octopi_videos_total"] == 2
-    assert "octopi_answer_seconds_sum" in after
 
 
 def test_addresses() -> None:
@@ -268,14 +245,12 @@ def test_tokens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert read_token(None) == ""
     (file := tmp_path / "token").write_text(f" {'x' * 16}\n")
     assert read_token(file) == "x" * 16
-    for content, words in (
-        *((weak.encode(), "openssl") for weak in ("short", "x" * 15, "ü" * 20, "a b\nc" * 5)),
-        (b"\n", "empty"),
-        (b"\xff\xfe", "--token-file"),
-    ):
+    for content in (*(weak.encode() for weak in ("", "\n", "x" * 15, "ü" * 20, "a b\nc" * 5)), b"\xff\xfe"):
         file.write_bytes(content)
-        with refused(words):
-            read_token(file)
-    for unreadable in (tmp_path, tmp_path / "none"):
         with refused("--token-file"):
-            read_token(unreadable)
+            read_token(file)
+    with refused("--token-file"):
+        read_token(tmp_path / "none")
+    monkeypatch.setenv("OCTOPI_TOKEN", "short")
+    with refused("OCTOPI_TOKEN.*openssl"):
+        read_token(None)

@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,6 @@ import httpx2
 import psutil
 import pytest
 
-from pipeline.use import serve, server
-from pipeline.use.media import Limits
 from pipeline.use.serve import make_app
 from pipeline.videos.catalogue import load_catalogue
 from tests.closure import ROOT
@@ -88,44 +86,9 @@ def test_no_answer_of_many_clients_is_lost_or_mixed_up() -> None:
 
 
 def test_a_refused_body_is_read_so_that_the_answer_is_seen() -> None:
-    with serving(FakeOctopi(), limits=Limits(body_bytes=100_000)) as address:
+    with serving(FakeOctopi(), most_bytes=100_000) as address:
         assert ask(address, b"x" * 300_000).status_code == 413
         assert ask(address, body(user("hello"))).status_code == 200
-
-
-def test_slow_clients_are_hung_up_on_and_others_are_answered(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The limits are short only while nobody is meant to keep them."""
-    monkeypatch.setattr(server, "HEADER_SECONDS", HUNG)
-    monkeypatch.setattr(serve, "UPLOAD_SECONDS", 0.1)
-    head = b"POST /v1/chat/completions HTTP/1.1\r\nHost: 127.0.0.1\r\n"
-    kept = b"GET /health HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
-
-    def received(client: socket.socket, end: bytes = b"") -> bytes:
-        """What comes until it ends so, or until the server hangs up."""
-        found = b""
-        while (piece := client.recv(10_000)) and not (end and (found + piece).endswith(end)):
-            found += piece
-        return found + piece
-
-    with serving(FakeOctopi(), places=1) as address, ExitStack() as stack:
-        port = int(address.rpartition(":")[2])
-
-        def connect() -> socket.socket:
-            return stack.enter_context(socket.create_connection(("127.0.0.1", port), HUNG))
-
-        slow_body, second = connect(), connect()
-        slow_body.sendall(head + b"Content-Type: application/json\r\nContent-Length: 50\r\n\r\n{")
-        assert b" 408 " in received(slow_body).split(b"\r\n")[0]
-        second.sendall(kept)
-        assert b"200 OK" in received(second, b"}")
-        monkeypatch.setattr(server, "HEADER_SECONDS", 0.1)
-        silent, slow_head = connect(), connect()
-        slow_head.sendall(head)
-        second.sendall(kept[:-2])
-        assert [received(client) for client in (silent, slow_head, second)] == [b""] * 3
-        monkeypatch.setattr(server, "HEADER_SECONDS", HUNG)
-        monkeypatch.setattr(serve, "UPLOAD_SECONDS", HUNG)
-        assert ask(address, body(user("hello"))).status_code == 200, "the place is free again"
 
 
 @pytest.mark.parametrize("stream", [False, True])
@@ -139,7 +102,6 @@ def test_who_hangs_up_frees_the_place_and_stops_the_model(stream: bool) -> None:
             wait_for(lambda: fake.asked == 1)
         # An answer without end leaves its place only where it is given up.
         wait_for(lambda: waiting(address) == 0)
-        assert "octopi_answer_seconds_count 0" in httpx2.get(f"{address}/metrics").text
         assert ask(address, body(user("hello"))).status_code == 200
 
 
@@ -175,8 +137,8 @@ def test_stopping_finishes_what_was_asked_and_leaves_no_process() -> None:
     with started() as (process, address), ThreadPoolExecutor(4) as pool:
         contents = [body(user(text(f"{i} " + "x " * 15), part(video(i))), stream=i == 3) for i in range(4)]
         answers = [pool.submit(ask, address, content) for content in contents]
-        # A busy machine takes longer to start the process that checks videos than to count who waits.
-        wait_for(lambda: waiting(address) == 4 and len(psutil.Process(process.pid).children()) > 0)
+        # Beside the process that checks videos, multiprocessing has one of its own.
+        wait_for(lambda: waiting(address) == 4 and len(psutil.Process(process.pid).children()) == 2)
         children = psutil.Process(process.pid).children()
         process.send_signal(signal.SIGTERM)
         wait_for(lambda: not listens(address))
@@ -186,7 +148,6 @@ def test_stopping_finishes_what_was_asked_and_leaves_no_process() -> None:
             assert said(answer.result().json()).split() == ["{tactile}", str(i), *"x" * 15, "|", digest(video(i))]
         assert events(answers[3].result().text)[-1] == "[DONE]"
         process.wait(HUNG)
-        assert len(children) == 1
         wait_until_ended(children)
 
 
@@ -195,7 +156,7 @@ def test_no_checking_process_outlives_a_killed_server() -> None:
         print(file=process.stdin, flush=True)
         assert ask(address, body(user(part(video())))).status_code == 200
         children = psutil.Process(process.pid).children()
-    assert len(children) == 1
+    assert len(children) == 2
     wait_until_ended(children)
 
 
