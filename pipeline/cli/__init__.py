@@ -245,10 +245,8 @@ def answer_with(
     folder: Annotated[
         Path | None, typer.Argument(metavar="[DIR]", help="Of the photos, or of kept frames (data/frames).")
     ] = None,
-    limit: Annotated[int | None, typer.Option(min=0, help="Most requests; a later call goes on.")] = None,
     temperature: Annotated[float, typer.Option(min=0, help="1 for models that take no other.")] = 0.0,
     max_tokens: Annotated[int, typer.Option(min=1, help="Of a reply.")] = 1024,
-    timeout: Annotated[float, typer.Option(min=0.1, help="Seconds that a reply may take.")] = 120.0,
     prompt: Annotated[
         Literal["own", "published"], typer.Option(help="published: the paper's three, which only ask for classes.")
     ] = "own",
@@ -256,13 +254,13 @@ def answer_with(
     """Let a model behind an endpoint answer the evaluation questions about pictures; OPENAI_API_KEY holds its key."""
     from pipeline.config.params import load_params
     from pipeline.core.records import Shown
-    from pipeline.evaluation.answer_with import Endpoint, ask_all
+    from pipeline.evaluation.answer_with import ask_all
 
     if folder is None and shown == "photos":
         raise UserError("DIR: name the folder with photos, as in `--input photos DIR`")
-    asked = Endpoint(endpoint.rstrip("/"), model, temperature, max_tokens, timeout)
+    settings = {"model": model, "temperature": temperature, "max_completion_tokens": max_tokens}
     place, published = folder or Path("data/frames"), prompt == "published"
-    typer.echo(ask_all(load_params(), asked, Shown(shown), place, limit, published=published))
+    typer.echo(ask_all(load_params(), endpoint.rstrip("/"), settings, Shown(shown), place, published=published))
 
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
