@@ -122,7 +122,7 @@ def make_app(model: Octopi, name: str, *, token: str = "", places: int = 32, mos
         most_bytes: Size of a request as sent, base64 included.
     """
     gate, worker = Gate(), Worker()
-    taken: set[Reply] = set()  # The places.
+    taken = 0
     entry = {"id": name, "object": "model", "created": int(time.time()), "owned_by": "octopi-pipeline"}
 
     @asynccontextmanager
@@ -144,6 +144,18 @@ def make_app(model: Octopi, name: str, *, token: str = "", places: int = 32, mos
         if wanted != name:
             raise HTTPException(404, f"model {wanted[:80]!r} is not served here; ask for {name!r}")
 
+    async def take_place() -> AsyncIterator[ExitStack]:
+        """One of the places, and what is to be closed behind the answer."""
+        nonlocal taken
+        if taken >= places:
+            raise HTTPException(429, f"all {places} places are taken; come again soon")
+        taken += 1
+        try:
+            with ExitStack() as stack:
+                yield stack
+        finally:
+            taken -= 1
+
     def prepare(body: bytes, stack: ExitStack) -> tuple[ChatRequest, list[Exchange]]:
         """The request and its conversation, whose videos are files until the stack is closed."""
         wanted = read_request(body)
@@ -163,20 +175,13 @@ def make_app(model: Octopi, name: str, *, token: str = "", places: int = 32, mos
         return pieces
 
     app = FastAPI(title="octopi serve", lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
-    guarded = [Depends(check_token)]
+    guarded, place = [Depends(check_token)], Depends(take_place)
 
     @app.post("/v1/chat/completions", dependencies=guarded)
-    async def chat(request: Request) -> Response:
-        if len(taken) >= places:
-            raise HTTPException(429, f"all {places} places are taken; come again soon")
-        reply = Reply(name)
-        with ExitStack() as stack:
-            taken.add(reply)
-            stack.callback(taken.remove, reply)
-            body = await _read(request, most_bytes)
-            wanted, exchanges = await asyncio.to_thread(prepare, body, stack)
-            # From here on the worker gives the place back, when it needs the files no more.
-            pieces = worker.answer(lambda: ask(wanted, exchanges, reply), stack.pop_all().close)
+    async def chat(request: Request, stack: ExitStack = place) -> Response:
+        reply, body = Reply(name), await _read(request, most_bytes)
+        wanted, exchanges = await asyncio.to_thread(prepare, body, stack)
+        pieces = worker.answer(lambda: ask(wanted, exchanges, reply))
         if wanted.stream:
             # What fails before the first piece has a status of its own.
             first = await anext(pieces, "")
@@ -200,7 +205,7 @@ def make_app(model: Octopi, name: str, *, token: str = "", places: int = 32, mos
 
     @app.get("/health")
     async def health() -> Json:
-        return {"status": "ok", "model": name, "waiting": len(taken), "places": places}
+        return {"status": "ok", "model": name, "waiting": taken, "places": places}
 
     @app.exception_handler(ClientDisconnect)
     async def left(_: Request, __: Exception) -> Response:

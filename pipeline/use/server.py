@@ -37,23 +37,17 @@ class Failed(Exception):
 class Job:
     """A question on its way to the model's thread, and the pieces of its answer on their way back."""
 
-    def __init__(self, ask: Callable[[], Iterable[Any]], done: Callable[[], object]) -> None:
-        self.ask, self.left, self._done = ask, False, done
+    def __init__(self, ask: Callable[[], Iterable[Any]]) -> None:
+        self.ask, self.left = ask, False
         self._loop, self._pieces = asyncio.get_running_loop(), asyncio.Queue[Any]()
 
     def put(self, piece: Any) -> None:
-        """Send a piece; an error is raised there, and None is the end."""
+        """Send a piece, or None behind the last; an error is raised there, and what is nobody's input is logged."""
+        if isinstance(piece, Exception) and not isinstance(piece, UserError):
+            logger.error("the model failed", exc_info=piece)
+            piece = Failed()
         with suppress(RuntimeError):  # The loop is closed: nobody waits.
             self._loop.call_soon_threadsafe(self._pieces.put_nowait, piece)
-
-    def end(self, error: Exception | None = None) -> None:
-        """Give the place and the files back first, so that who has the answer finds the place free."""
-        if error is not None and not isinstance(error, UserError):
-            logger.error("the model failed", exc_info=error)
-            error = Failed()
-        with suppress(Exception):
-            self._done()
-        self.put(error)
 
     async def pieces(self) -> AsyncGenerator[Any]:
         """What was put; `left` is set where nobody takes it any more."""
@@ -75,22 +69,18 @@ class Worker:
         self._thread = threading.Thread(target=self._work, name="octopi-model", daemon=True)
         self._thread.start()
 
-    def answer(
-        self, ask: Callable[[], Iterable[Any]], done: Callable[[], object] = lambda: None
-    ) -> AsyncGenerator[Any]:
+    def answer(self, ask: Callable[[], Iterable[Any]]) -> AsyncGenerator[Any]:
         """Queue a question, and yield the pieces of its answer as they are made; who closes this gives it up.
 
         Args:
             ask: Called in the thread, where its pieces are made, too. Pieces with a method `together`, as `Stream` has
                 it, are made in one batch with those of others.
-            done: Called in the thread behind the last piece, also where the answer failed or was given up.
 
         Raises:
             UserError: as `ask` raises it.
             Failed: where it raises anything else.
         """
-        job = Job(ask, done)
-        # Queued here and not at the first piece: `done` is called even where nobody asks for a piece.
+        job = Job(ask)
         self._jobs.put(job)
         return job.pieces()
 
@@ -114,10 +104,12 @@ class Worker:
         """Answer what cannot be in a batch by itself, then the others in one."""
         batch: list[tuple[Job, Any]] = []
         for job in jobs:
+            if job.left:
+                continue
             try:
-                pieces = () if job.left else job.ask()
+                pieces = job.ask()
             except Exception as error:
-                job.end(error)
+                job.put(error)
                 continue
             if hasattr(pieces, "together"):
                 batch.append((job, pieces))
@@ -129,22 +121,16 @@ class Worker:
             self._hand_out([job for job, _ in batch], together, left)
 
     def _hand_out(self, jobs: Sequence[Job], pieces: Iterable[tuple[int, Any]], left: set[int]) -> None:
-        """Give jobs their pieces, each by the job's place, None behind the last; `left` gets the places of who left."""
-        waiting = dict(enumerate(jobs))
+        """Give jobs their pieces, each by the job's place; `left` gets the places of who left, or has all."""
         try:
             for place, piece in pieces:
-                if piece is not None and place in waiting:
-                    waiting[place].put(piece)
-                elif place in waiting:
-                    waiting.pop(place).end()
-                for gone in [place for place, job in waiting.items() if job.left]:
-                    left.add(gone)
-                    waiting.pop(gone).end()
-                if not waiting:
+                jobs[place].put(piece)
+                left.update(i for i, job in enumerate(jobs) if job.left)
+                if len(left) == len(jobs):
                     return
         except Exception as error:
-            for job in waiting.values():
-                job.end(error)
+            for job in jobs:
+                job.put(error)
 
 
 def make_server(app: FastAPI) -> uvicorn.Server:
