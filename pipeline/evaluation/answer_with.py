@@ -122,7 +122,7 @@ def ask_all(
             write_jsonl(place / f"{seed}.jsonl", predictions)
         # Written last, since this file vouches that the answers beside it belong to these questions.
         used = asker.used.values()
-        days, ended = sorted(reply.day for reply in used), Counter(sorted(reply.ended for reply in used))
+        days, ended = sorted(reply.day for reply in used) or [""], Counter(sorted(reply.ended for reply in used))
         source = VisionModel(
             model=settings["model"] + (", published prompts" if published else ""),
             served_as=tuple(sorted({reply.model for reply in used})),

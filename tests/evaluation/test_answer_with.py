@@ -230,9 +230,6 @@ def test_published_prompts_ask_for_one_class_a_property(project: Path, server: S
     scores = {(s.question_id, s.measure): s for s in graded()}
     read = [{p.name: scores[q.question_id, p.name] for p in catalogue.properties} for q in asked() if q.task == "OPD"]
     assert {s.model for s in scores.values()} == {"some-maker/sees-1, published prompts"}
-    text = (reported().folder / "README.md").read_text()
-    assert "it was asked the paper's prompt for PG-InstructBLIP, without examples. How its replies ended" in text
-    assert "training questions" not in text
     assert [[s.parsed for s in found.values()] for found in read] == [[True, True, False], [True, False, True]]
     first, second = (catalogue.labels(q.objects[0]) for q in asked() if q.task == "OPD")
     assert [read[0]["hardness"].correct, read[0]["roughness"].correct] == [first[0] == 1, first[1] == 0]
@@ -242,8 +239,6 @@ def test_published_prompts_ask_for_one_class_a_property(project: Path, server: S
 FAILURES: dict[str, tuple[Step, str]] = {
     "key": (lambda n: as_json({"error": {"message": f"Incorrect key: {KEY}"}}, 401), r"401.*Incorrect key: \[key\]"),
     "a page": (lambda n: (200, {"Content-Type": "text/html"}, b"<html>\n<p>Welcome"), "Welcome.*URL"),
-    "no JSON": (lambda n: (200, {"Content-Type": "application/json"}, b'{"choices": ['), "Expecting"),
-    "error with status 200": (lambda n: as_json({"error": {"message": "upstream is down"}}), "upstream is down"),
     "no choice": (lambda n: answered(None, choices=[]), "no chat completion"),
 }
 
@@ -388,13 +383,8 @@ def test_it_is_a_row_of_the_report_with_where_it_comes_from(project: Path, serve
     whole = dict.fromkeys((("PSS", "choice"), ("POM", "choice"), ("PSR", "choice"), ("OPD", "combined")), (2, 1.0, 0))
     assert {**whole, ("PC", "choice"): (2, 0.5, 1)}.items() <= found.items()
     assert set(rows["touch"]) == {"frames"}
-    text = (report.folder / "README.md").read_text()
-    lines = [line for line in text.splitlines() if "some-maker/sees-1, frames of the videos" in line]
-    assert len(lines) == 5 + 3, "a row a task, and one a property"
     (source,) = report.provenance["vision"]
     assert (source["endpoint"], source["served_as"], source["ended"]) == (server.url, ["sees-1-of-may"], {"stop": 12})
-    assert "**Vision alone:** `some-maker/sees-1` (there sees-1-of-may)" in text
-    assert "It was told the classes and, where a task is trained, up to three training questions. How" in text
     assert set(report.effects["part"]) <= {"language"}, "what parts bring is about our own system alone"
 
 
