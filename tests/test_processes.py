@@ -13,7 +13,6 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
-from importlib.util import find_spec
 from pathlib import Path
 
 import psutil
@@ -295,12 +294,11 @@ if __name__ == "__main__":
 """
 
 MODELS = """
-import os, sys
 from pathlib import Path
-import torch
+from types import SimpleNamespace
+import ray, torch
 from pipeline.core.embeddings import EmbeddingStore
 from pipeline.encoder.embed import EncoderSource, embed_videos
-from pipeline.core import parallel
 from pipeline.core.io import read_table
 from pipeline.language import generate
 from pipeline.core.parallel import use_backend
@@ -308,7 +306,7 @@ from pipeline.core.records import Assignment, Encoder, Lora, Opd, Variant
 from tests.use.shared import make
 
 def main():
-    parallel.cores = lambda: 2
+    ray.init(num_cpus=2, log_to_driver=False)
     torch.set_num_threads(1)
     made = make(Path.cwd(), Variant(Encoder.FINETUNED, Lora.WITH, Opd.ALL, 0))
     params, data = made.params, Path("data")
@@ -321,9 +319,9 @@ def main():
     store, model = EmbeddingStore(data / "embeddings" / "finetuned-0"), source()
     said = generate.answer(model, store, made.questions, Opd.ALL, language, params.frames.per_video, source)
 
-    use_backend(sys.argv[1])
+    use_backend("ray")
     generate.greedy = None  # Not in this process.
-    there = embed_videos(encoder()._replace(encoder=None), parts, encoder)
+    there = embed_videos(encoder()._replace(encoder=SimpleNamespace(dim=here[0].shape[1])), parts, encoder)
     assert torch.equal(here[0], there[0]) and here[1] == there[1]
     assert generate.answer(model, store, made.questions, Opd.ALL, language, params.frames.per_video, source) == said
     assert len(said) > 40 and len({p.outputs for p in said}) > 10
@@ -341,9 +339,6 @@ def run_script(text: str, folder: Path, *arguments: str) -> None:
     assert done.returncode == 0, done.stderr[-3000:]
 
 
-needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="needs ray: pip install -e '.[ray]'")
-
-
 @pytest.fixture(scope="module")
 def made_alone(tiny_videos: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """The sha256 of each file that is made of the videos one after another, in this process."""
@@ -359,7 +354,7 @@ def hashes(folder: Path) -> dict[str, str]:
     return {f.name: hashlib.sha256(f.read_bytes()).hexdigest() for f in folder.iterdir()}
 
 
-@pytest.mark.parametrize("backend", ["processes", pytest.param("ray", marks=needs_ray)])
+@pytest.mark.parametrize("backend", ["processes", "ray"])
 def test_two_workers_make_the_same_bytes_on_either_backend(
     backend: str, made_alone: dict[str, str], tiny_videos: Path, tmp_path: Path
 ) -> None:
@@ -373,6 +368,5 @@ def test_two_workers_make_the_same_bytes_on_either_backend(
     assert hashes(tmp_path / "out") == made_alone
 
 
-@needs_ray
 def test_a_cluster_embeds_and_answers_to_the_same_bytes(tmp_path: Path) -> None:
-    run_script(MODELS, tmp_path, "ray")
+    run_script(MODELS, tmp_path)
