@@ -179,7 +179,7 @@ def test_a_worker_that_outlives_a_stage_loads_anew(tmp_path: Path, monkeypatch: 
 
 
 def test_a_backend_is_a_parameter_and_may_lack_its_package(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    params = compose("smoke", ["runtime.parallel=ray"], ROOT / "conf")
+    params = compose("smoke", ["runtime.parallel=ray", "kernels=machine"], ROOT / "conf")
     monkeypatch.setattr(parallel, "find_spec", lambda _: None)
     for check in (lambda: check_inputs(params), lambda: use_backend("ray")):
         monkeypatch.chdir(ROOT)

@@ -1,8 +1,4 @@
-"""Work on many files at once: in processes of this machine, or on a cluster of Ray's.
-
-joblib supports both but fits neither: its own workers outlive a killed parent and cost over a second of processor time
-a call, and with Ray it yields nothing before all jobs are done.
-"""
+"""Work on many files at once: in processes of this machine, or on a cluster of Ray's."""
 
 from __future__ import annotations
 
@@ -12,12 +8,12 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from functools import lru_cache
 from importlib.util import find_spec
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -31,8 +27,6 @@ M = TypeVar("M")
 R = TypeVar("R")
 
 _chosen: Backend = "processes"
-HANDOVER_SECONDS = 5.0
-"""Seconds that a worker may take to hand over a result, after Ctrl-C, before it is ended."""
 
 
 def use_backend(name: Backend) -> None:
@@ -49,10 +43,7 @@ def check_backend(name: Backend) -> None:
 
 
 def end_with_parent(parent: int, grace: float = 0.0) -> None:
-    """End this process within a second of its parent's death, after `grace` seconds in which it may end by itself.
-
-    A worker waits for jobs for ever, and a pipe that it inherited stays open: `dvc repro | cat` would never end.
-    """
+    """End this process within a second of its parent's death, after `grace` seconds in which it may end by itself."""
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -68,7 +59,7 @@ def run_parallel(
 ) -> Iterator[R]:
     """Apply `work` to every job on the chosen backend; yield results in the order of the jobs.
 
-    An error or an interrupt stops what has not begun.
+    An error or an interrupt ends what runs.
 
     Args:
         device: Whether a job takes a GPU of a cluster that has any.
@@ -117,49 +108,60 @@ def _loaded(source: Callable[[], Any]) -> Any:
 
 
 def _in_processes(work: Callable[[J], R], jobs: Sequence[J], label: str) -> Iterator[R]:
-    """In as many processes as there are cores.
+    """In as many processes as there are cores, each with a pipe of its own, which closes where it dies.
 
     Linux forks, since a fresh interpreter costs more than many whole videos; elsewhere the platform's way is used, and
     the caller's script needs a main guard.
     """
     context = multiprocessing.get_context("fork" if sys.platform == "linux" else None)
-    pool = ProcessPoolExecutor(
-        min(cores(), len(jobs)), mp_context=context, initializer=end_with_parent, initargs=(os.getpid(),)
-    )
-    mask: Any = getattr(signal, "pthread_sigmask", lambda *_: ())  # Windows has none.
-    done = 0
+    workers, found, taken = dict[Any, Any](), dict[int, tuple[Any, Exception | None]](), context.Value("q")
+    # Workers inherit the blocked SIGINT, so that on Ctrl-C only this process reacts, and ends them.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        # Workers inherit the blocked SIGINT, so that on Ctrl-C only this process reacts, and ends them.
-        before = mask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
-            # A few jobs at a time: handing over each alone costs as much as a tenth of decoding it.
-            results: Any = pool.map(work, jobs, chunksize=max(1, min(4, len(jobs) // (8 * cores()))))
-        finally:
-            mask(signal.SIG_SETMASK, before)
-        for result in results:
+        for _ in range(min(cores(), len(jobs))):
+            here, there = context.Pipe(duplex=False)
+            workers[here] = context.Process(target=_take, args=(os.getpid(), work, jobs, taken, there), daemon=True)
+            workers[here].start()
+            there.close()
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for number, job in enumerate(jobs):
+            while number not in found:
+                for pipe in wait(list(workers)):
+                    try:
+                        done, *found[done] = pipe.recv()
+                    except (EOFError, OSError):
+                        raise _died(label, job) from None
+            result, error = found.pop(number)
+            if error:
+                raise error
             yield result
-            done += 1
-    except BrokenProcessPool:
-        raise _died(label, jobs[done]) from None
-    except KeyboardInterrupt:
-        # On other errors the shutdown below waits for running jobs; on Ctrl-C they are terminated. The lock keeps a
-        # worker from being terminated while it writes a result: the pool would wait for the rest of it.
-        handing: Any = pool._result_queue._wlock  # type: ignore[attr-defined]
-        if handing is not None:
-            handing.acquire(timeout=HANDOVER_SECONDS)
-        # The pool's own thread then raises errors for jobs that are both cancelled and lost; they are hidden.
-        threading.excepthook = lambda _: None
-        for worker in multiprocessing.active_children():
-            worker.terminate()
-        raise
     finally:
-        pool.shutdown(cancel_futures=True)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for worker in workers.values():
+            worker.kill()
+        for worker in workers.values():
+            worker.join()
+
+
+def _take(parent: int, work: Callable[[J], R], jobs: Sequence[J], taken: Any, pipe: Any) -> None:
+    """What a worker does until it is ended: take the next job, and hand over its number, result and error."""
+    end_with_parent(parent)
+    while True:
+        with taken.get_lock():
+            number, taken.value = taken.value, taken.value + 1
+        if number >= len(jobs):
+            threading.Event().wait()
+        try:
+            pipe.send((number, work(jobs[number]), None))
+        except Exception as error:
+            error.add_note(traceback.format_exc())  # Which does not travel.
+            pipe.send((number, None, error))
 
 
 def _on_ray(work: Callable[[J], R], jobs: Sequence[J], label: str, device: bool) -> Iterator[R]:
     """On all workers of the cluster that `RAY_ADDRESS` names, else of one on this machine.
 
-    Workers see the project under this machine's path.
+    Workers see the project under this machine's path. What has not begun ends with this process.
     """
     import ray
 
@@ -175,16 +177,13 @@ def _on_ray(work: Callable[[J], R], jobs: Sequence[J], label: str, device: bool)
     folder = os.getcwd()
     remote = ray.remote(num_gpus=gpus)(lambda job: _there(folder, work, job))
     waiting = deque(remote.remote(job) for job in jobs)
-    try:
-        while waiting:
+    for job in jobs:
+        try:
             yield ray.get(waiting.popleft())
-    except ray.exceptions.RayTaskError as error:
-        raise error.cause from None
-    except ray.exceptions.RayError:  # Ray's own message about a lost worker fills a page.
-        raise _died(label, jobs[len(jobs) - len(waiting) - 1]) from None
-    finally:
-        for each in waiting:
-            ray.cancel(each)
+        except ray.exceptions.RayTaskError as error:
+            raise error.cause from None
+        except ray.exceptions.RayError:  # Ray's own message about a lost worker fills a page.
+            raise _died(label, job) from None
 
 
 def _there(folder: str, work: Callable[[J], R], job: J) -> R:
