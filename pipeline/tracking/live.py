@@ -54,19 +54,16 @@ def live(run: Stage) -> Iterator[list[Any]]:
 
 def _begin(run: Stage) -> tuple[Store, str, Any]:
     """Begin the stage's run below this folder's reproduction, and the watch on the machine's load."""
-    store = Store(run.params.tracking)
+    store, started = Store(run.params.tracking), int(run.started * 1000)
     from mlflow.system_metrics.system_metrics_monitor import SystemMetricsMonitor
 
-    stages, started = read_stages(run.params), int(run.started * 1000)
     with store.lock:
         # A stage runs once at a time: what is still running was killed.
         store.kill({STAGE: run.name})
-        parent = store.open_reproduction(run.params)
-        if parent is None:
-            earlier = [began for began, _, _ in store.fresh(stages).values()]
-            parent = store.create(run.params.report_name, "reproduction", min([started, *earlier]))
-        child = store.create(run.name, "stage", started, {STAGE: run.name, PARENT: parent})
-        store.log(child, params=settings(run.params, axes(run.name)))
+        earlier = [began for began, _, _ in store.fresh(read_stages(run.params)).values()]
+        parent = store.open_reproduction(run.params, min([started, *earlier]))
+        own = settings(run.params, axes(run.name))
+        child = store.create(run.name, "stage", started, own, {STAGE: run.name, PARENT: parent})
     monitor = SystemMetricsMonitor(child, tracking_uri=store.uri)
     monitor.start()
     return store, child, monitor

@@ -29,7 +29,6 @@ from pipeline.tracking.chain import (
     read_stages,
     settings,
 )
-from pipeline.tracking.registry import log_model, register
 from pipeline.tracking.store import KIND, LOCK, PARENT, STAGE, Store, TrackingError, cause, out_of_reach
 
 VARIANT, CONTENT, STATE = "octopi.variant", "octopi.content", "octopi.state"
@@ -72,31 +71,23 @@ def publish(params: Params) -> str:
 def _publish(store: Store, params: Params, stages: Mapping[str, ChainStage]) -> str:
     now, fresh = int(time.time() * 1000), store.fresh(stages)
     state = digest([params.report_name, *(stage.lock for stage in stages.values())])
-    parent = store.open_reproduction(params)
-    if parent is None:
-        if not fresh and (same := store.find({KIND: "reproduction", STATE: state})):
-            return f"nothing new since run {same[0].info.run_id}"
-        begin = min((began for began, _, _ in fresh.values()), default=now)
-        parent = store.create(params.report_name, "reproduction", begin)
+    if not fresh and (same := store.find({KIND: "reproduction", STATE: state})):
+        store.kill({KIND: "reproduction"})
+        return f"nothing new since run {same[0].info.run_id}"
+    parent = store.open_reproduction(params, min((began for began, _, _ in fresh.values()), default=now))
     for title, ran in fresh.items():
         _complete(store, params, parent, title, stages[title], *ran)
-    done = store.find({KIND: "stage", PARENT: parent})
-    ended = [run.info.end_time for run in done if LOCK in run.data.tags]
+    ended = [run.info.end_time for run in store.find({KIND: "stage", PARENT: parent}) if LOCK in run.data.tags]
     new, links = _variants(store, params, parent, stages)
     report = REPORTS / params.report_name
     if report.is_dir():
         store.client.log_artifacts(parent, str(report), "report")
     summary = read_json(report / "metrics.json") if (report / "metrics.json").is_file() else {}
-    # Where publishing was cut off some are there, and MLflow refuses other values.
-    known = store.client.get_run(parent).data.params
-    own = {name: value for name, value in settings(params).items() if name not in known}
-    store.log(parent, [(name, float(value), now, 0) for name, value in flatten(summary)], own)
-    about = {
-        "octopi.dvc_lock": digest([CHAIN_LOCK.read_text(encoding="utf-8")]),
-        NOTE: f"{len(ended)} stages ran, the others came from DVC's cache. Tables and figures: Artifacts, "
-        "`report/README.md`.",
-    }
-    store.log(parent, tags={**about, **links, STATE: state}, end=max(ended, default=now))
+    store.log(parent, [(name, float(value), now, 0) for name, value in flatten(summary)])
+    about = f"{len(ended)} stages ran, the others came from DVC's cache. Tables: Artifacts, `report/README.md`."
+    lock = digest([CHAIN_LOCK.read_text(encoding="utf-8")])
+    tags = {"octopi.dvc_lock": lock, NOTE: about, **links, STATE: state}
+    store.finish(parent, max(ended, default=now), tags)
     return f"run {parent} in {store.uri}: {len(ended)} stages ran, {new} variants are new"
 
 
@@ -104,69 +95,61 @@ def _complete(
     store: Store, params: Params, parent: str, title: str, stage: ChainStage, began: int, ended: int, run: Any | None
 ) -> None:
     """A run of a stage that ran; one that was logged live gets what it lacks."""
-    # Keep the parameters that a live run logged: settings may have changed since.
-    own = {} if run else settings(params, axes(title))
-    run_id = run.info.run_id if run else store.create(title, "stage", began, {STAGE: title, PARENT: parent})
+    tags, there = {STAGE: title, PARENT: parent}, set[tuple[str, int]]()
+    if run:
+        run_id = run.info.run_id
+        there = {(name, m.step) for name in run.data.metrics for m in store.client.get_metric_history(run_id, name)}
+    else:
+        run_id = store.create(title, "stage", began, settings(params, axes(title)), tags)
     history = next((path for out in stage.outs if (path := Path(out) / "history.parquet").is_file()), None)
     curve = read_table(history, Measurement) if history else []
     steps = max((m.step for m in curve), default=0) or 1
-    logged = set(run.data.metrics if run else ())
-    there = {(name, m.step) for name in logged for m in store.client.get_metric_history(run_id, name)}
-    times = {m.step: began + (ended - began) * m.step // steps for m in curve}
-    points = [(m.name, m.value, times[m.step], m.step) for m in curve if (m.name, m.step) not in there]
+    points = [(m.name, m.value, began + (ended - began) * m.step // steps, m.step) for m in curve]
     # The end of a curve is no point at its step 0.
-    logged |= {m.name for m in curve}
-    points += [(name, float(value), ended, 0) for name, value in stage.metrics.items() if name not in logged]
-    store.log(run_id, points, own)
-    store.log(run_id, tags={LOCK: stage.lock}, end=ended)
+    points += [(n, float(value), ended, 0) for n, value in stage.metrics.items() if n not in {m.name for m in curve}]
+    store.log(run_id, [point for point in points if (point[0], point[3]) not in there])
+    store.finish(run_id, ended, {LOCK: stage.lock})
 
 
 def _variants(
     store: Store, params: Params, parent: str, stages: Mapping[str, ChainStage]
 ) -> tuple[int, dict[str, str]]:
-    """Runs of variants whose results are new, the best one's model, and the table of all.
+    """Runs of variants whose results are new, and the table of all.
 
     Returns:
-        How many are new, and tags with the runs of the others and the best model's address.
+        How many are new, and tags with the runs of the others.
     """
-    scores, new, links, models = accuracies(params), 0, dict[str, str](), list[tuple[Variant, str]]()
+    scores, new, links = accuracies(params), 0, dict[str, str]()
     store.kill({KIND: "variant"})
     for variant in params.ablation.variants():
         stage = stages.get(f"answer@{variant.key}")
         if stage is None:
             continue
-        metrics, folder = scores.get(variant.key, {}), Path("models") / variant.key
+        trained, metrics = f"{variant.encoder}-{variant.opd}-{variant.seed}", scores.get(variant.key, {})
+        made = {"predictions": DATA / "answers" / variant.key, "model": DATA / "models" / variant.lora / trained}
+        made["alignment"] = DATA / "models" / Lora.WITHOUT / trained
+        made["encoder"] = DATA / "encoder" / str(variant.seed)
+        made["package"] = Path("models") / variant.key
         # A folder that is packaged is whole when it has its card.
-        card = folder / "config.json"
-        made_of = [card.read_text(encoding="utf-8")] if card.is_file() else []
-        content = digest([metrics, stage.outs, *made_of])
+        card = made["package"] / "config.json"
+        content = digest([metrics, stage.outs, *([card.read_text(encoding="utf-8")] if card.is_file() else [])])
         if old := store.find({VARIANT: variant.key, CONTENT: content}):
-            run = old[0].info.run_id
             if old[0].data.tags.get(PARENT) != parent:
-                links[f"variant.{variant.key}"] = run
-        else:
-            begin, end = stage.ran or (int(time.time() * 1000),) * 2
-            run = store.create(variant.key, "variant", begin, {VARIANT: variant.key, PARENT: parent})
-            # Whole tasks before their parts, as the dashboard keeps the order.
-            ordered = sorted(metrics.items(), key=lambda metric: ("." in metric[0], metric[0]))
-            factors = {axis: str(value) for axis, value in variant._asdict().items()}
-            store.log(run, [(name, value, end, 0) for name, value in ordered], settings(params, factors))
-            trained = f"{variant.encoder}-{variant.opd}-{variant.seed}"
-            made = {"predictions": Path("answers") / variant.key, "model": Path("models") / variant.lora / trained}
-            if variant.lora is Lora.WITH:
-                made["alignment"] = Path("models") / Lora.WITHOUT / trained
-            if variant.encoder is Encoder.FINETUNED:
-                made["encoder"] = Path("encoder") / str(variant.seed)
-            for place, path in made.items():
-                if (DATA / path).is_dir():
-                    store.client.log_artifacts(run, str(DATA / path), place)
-            if made_of:
-                log_model(store.client, run, params, variant, folder)
-            store.log(run, tags={CONTENT: content}, end=end)
-            new += 1
-        models += [(variant, run)] if made_of else []
-    if models:
-        links["octopi.model"] = register(store.client, params, models)
+                links[f"variant.{variant.key}"] = old[0].info.run_id
+            continue
+        begin, end = stage.ran or (int(time.time() * 1000),) * 2
+        factors = {axis: str(value) for axis, value in variant._asdict().items()}
+        tags = {VARIANT: variant.key, PARENT: parent}
+        run = store.create(variant.key, "variant", begin, settings(params, factors), tags)
+        # Whole tasks before their parts, as the dashboard keeps the order.
+        ordered = sorted(metrics.items(), key=lambda metric: ("." in metric[0], metric[0]))
+        store.log(run, [(name, value, end, 0) for name, value in ordered])
+        unused = {"alignment": variant.lora is Lora.WITHOUT, "encoder": variant.encoder is not Encoder.FINETUNED}
+        for place, path in made.items():
+            if path.is_dir() and not unused.get(place):
+                store.client.log_artifacts(run, str(path), place)
+        store.finish(run, end, {CONTENT: content})
+        new += 1
     for name, value in _front_page(store.experiment, store.find({KIND: "variant"})).items():
         store.client.set_experiment_tag(store.experiment, name, value)
     return new, links

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 from pipeline.config import Params, TrackingConfig
 from pipeline.config.params import main_folder
 from pipeline.core.errors import UserError, without_secrets
-from pipeline.tracking.chain import ChainStage
+from pipeline.tracking.chain import ChainStage, settings
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -78,7 +78,6 @@ class Store:
         )
         import mlflow.store.db.utils
         from filelock import FileLock
-        from mlflow.utils.rest_utils import http_request
 
         for name in ("alembic", "mlflow"):
             logging.getLogger(name).setLevel(logging.ERROR)
@@ -99,23 +98,24 @@ class Store:
         # Several first starts at once on a new database break it.
         with self.lock:
             self.client = mlflow.MlflowClient(self.uri, self.uri)
-            if tracking.uri.startswith("http"):
-                # An older server does not know models as this client logs them, and answers each with an HTML page.
-                said = http_request(self.client._tracking_client.store.get_host_creds(), "/version", "GET")
-                if said.ok and said.text[:2] in ("0.", "1.", "2."):
-                    raise TrackingError(f"tracking.uri: {tracking.uri} is MLflow {said.text}; name one of 3 or newer")
-            if found := self.client.get_experiment_by_name(tracking.experiment):
-                self.experiment = str(found.experiment_id)
-                if found.lifecycle_stage != "active":
-                    mend = f"name another, or restore it: mlflow experiments restore -x {self.experiment}"
-                    raise TrackingError(f"tracking.experiment: {tracking.experiment} was deleted in MLflow; {mend}")
-                return
-            if not tracking.uri:
-                # MLflow makes a path in a call absolute, so artifacts would stay behind when the folder is moved.
-                self.client._tracking_client.store.artifact_root_uri = (MLRUNS / "artifacts").as_posix()
-            # Without the kind, the dashboard takes the experiment for a chat application's.
-            kind = {"mlflow.experimentKind": "custom_model_development"}
-            self.experiment = str(self.client.create_experiment(tracking.experiment, tags=kind))
+            found = self.client.get_experiment_by_name(tracking.experiment)
+            self.experiment = str(found.experiment_id if found else self._make(tracking))
+        if found and found.lifecycle_stage != "active":
+            mend = f"name another, or restore it: mlflow experiments restore -x {self.experiment}"
+            raise TrackingError(f"tracking.experiment: {tracking.experiment} was deleted in MLflow; {mend}")
+
+    def _make(self, tracking: TrackingConfig) -> str:
+        from mlflow.entities import ExperimentTag
+        from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
+
+        # Without the kind, the dashboard takes the experiment for a chat application's.
+        kind = "mlflow.experimentKind", "custom_model_development"
+        if tracking.uri:
+            return str(self.client.create_experiment(tracking.experiment, tags=dict([kind])))
+        # The client makes the path absolute, so that artifacts would stay behind when the folder is moved.
+        store = SqlAlchemyStore(self.uri, str(MLRUNS))
+        store.artifact_root_uri = (MLRUNS / "artifacts").as_posix()
+        return str(store.create_experiment(tracking.experiment, tags=[ExperimentTag(*kind)]))
 
     def find(self, tags: Mapping[str, str], *conditions: str) -> list[Any]:
         """Runs with all these tags, the youngest first."""
@@ -134,11 +134,8 @@ class Store:
         return found
 
     def kill(self, tags: Mapping[str, str], but: str = "") -> str | None:
-        """Mark runs of this folder that nobody will end any more; the youngest of the name `but` is left.
-
-        Returns:
-            The run that is left.
-        """
+        """Mark runs of this folder that nobody will end any more; the youngest of the name `but` is left, and its id
+        given."""
         running = self.find({**self.mine, **tags}, "attributes.status = 'RUNNING'")
         left = next((str(run.info.run_id) for run in running if run.info.run_name == but), None)
         for run in running:
@@ -146,36 +143,33 @@ class Store:
                 self.client.set_terminated(run.info.run_id, "KILLED")
         return left
 
-    def open_reproduction(self, params: Params) -> str | None:
-        """The reproduction of this folder that a training began and nobody published yet; those of other scales end."""
-        return self.kill({KIND: "reproduction"}, but=params.report_name)
+    def open_reproduction(self, params: Params, begin: int) -> str:
+        """The reproduction of this folder that nobody published yet, else a new one; those of other scales end."""
+        left = self.kill({KIND: "reproduction"}, but=params.report_name)
+        return left or self.create(params.report_name, "reproduction", begin, settings(params))
 
-    def create(self, name: str, kind: str, start: int, tags: Mapping[str, str] | None = None) -> str:
-        """Begin a run."""
+    def create(
+        self, name: str, kind: str, start: int, params: Mapping[str, str], tags: Mapping[str, str] | None = None
+    ) -> str:
+        """Begin a run with these parameters and tags."""
+        from mlflow.entities import Param
         from mlflow.utils.git_utils import get_git_commit
 
         commit = {"mlflow.source.git.commit": get_git_commit(str(Path.cwd())) or "unknown"}
         own = {KIND: kind, **self.mine, "mlflow.user": "octopi", **commit, **(tags or {})}
-        return str(self.client.create_run(self.experiment, start, own, name).info.run_id)
+        run = str(self.client.create_run(self.experiment, start, own, name).info.run_id)
+        self.client.log_batch(run, params=[Param(*param) for param in params.items()], synchronous=True)
+        return run
 
-    def log(
-        self,
-        run: str,
-        metrics: Sequence[tuple[str, float, int, int]] = (),
-        params: Mapping[str, str] | None = None,
-        tags: Mapping[str, str] | None = None,
-        end: int | None = None,
-    ) -> None:
-        """Add metrics (name, value, time, step), parameters and tags to a run; with an `end`, it is finished then."""
-        from mlflow.entities import Metric, Param, RunTag
+    def log(self, run: str, metrics: Sequence[tuple[str, float, int, int]]) -> None:
+        """Add metrics: name, value, time and step."""
+        from mlflow.entities import Metric
 
         # Synchronous, so that a failure shows here.
-        self.client.log_batch(
-            run,
-            [Metric(*metric) for metric in metrics],
-            [Param(name, value) for name, value in (params or {}).items()],
-            [RunTag(name, value) for name, value in (tags or {}).items()],
-            synchronous=True,
-        )
-        if end is not None:
-            self.client.set_terminated(run, "FINISHED", end)
+        self.client.log_batch(run, [Metric(*metric) for metric in metrics], synchronous=True)
+
+    def finish(self, run: str, end: int, tags: Mapping[str, str]) -> None:
+        """Add the tags by which a run is known to be whole, and end it."""
+        for name, value in tags.items():
+            self.client.set_tag(run, name, value)
+        self.client.set_terminated(run, "FINISHED", end)

@@ -268,47 +268,24 @@ def test_an_experiment_publishes_into_the_project_and_by_its_own_code(chain: Fak
     assert run("git status --porcelain -- mlruns") == ""
 
 
-def test_packaged_variants_are_models_and_the_validated_full_system_is_best(
-    chain: FakeChain, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    card = {"config.json": json.dumps({"base": {"folder": "x"}}), "README.md": "---\nlicense: mit\n---\n# Card\n"}
-    for key in (FULL, BASE):
-        folder = Path("models") / key
-        folder.mkdir(parents=True)
-        for file, text in card.items():
-            (folder / file).write_text(text)
-    for place in (Path("models") / FULL).iterdir():
+def test_a_packaged_folder_is_logged_with_its_card(again: FakeChain) -> None:
+    folder, cached = Path("models") / FULL, Path("cached").absolute()
+    folder.mkdir(parents=True)
+    for minutes, text in ((60, "x"), (120, "y")):
         # As DVC's `cache.type symlink` leaves it: the name in models/, the file in the cache, read-only.
-        cached = place.rename(Path(place.stem).absolute())
-        cached.chmod(0o444)
-        place.symlink_to(cached)
-    with monkeypatch.context() as patch:
-        patch.setenv("MLFLOW_REGISTRY_URI", "sqlite:///stray.db")
-        publish(chain.params)
-    there, variants = client(), by_name("variant")
-    experiment = there.get_experiment_by_name("octopi").experiment_id
-    models = there.search_logged_models([experiment])
-    assert {m.source_run_id for m in models} == {variants[FULL].info.run_id, variants[BASE].info.run_id}
-    name = f"octopi-{chain.params.report_name}"
-    best = there.get_model_version_by_alias(name, "best")
-    assert best.run_id == variants[FULL].info.run_id
-    assert best.tags == {"variant": FULL}
-    assert seconds(variants[FULL]) == SECONDS
-    # Relative, so that the folder may be moved.
-    assert not Path(best.source).is_absolute()
-    assert yaml.safe_load((Path(best.source) / "MLmodel").read_text())["metadata"]["license"] == "mit"
-    for file, text in card.items():
-        (logged,) = (Path(best.source) / "artifacts").rglob(file)
-        assert not logged.is_symlink()
-        assert logged.read_text() == text
-    publish(chain.params)
-    assert len(there.search_logged_models([experiment])) == 2
-    assert len(there.search_model_versions(f"name = '{name}'")) == 1
-    # A model that was packaged anew is a new one.
-    (Path("models") / FULL / "config.json").unlink()
-    (Path("models") / FULL / "config.json").write_text(json.dumps({"base": {"folder": "y"}}))
-    chain.ran(["grade"], 60)
-    publish(chain.params)
-    assert len(there.search_logged_models([experiment])) == 3
-    assert [m.version for m in there.search_model_versions(f"name = '{name}'")] in (["2", "1"], [2, 1])
-    assert str(there.get_model_version_by_alias(name, "best").version) == "2"
+        (cached / text).mkdir(parents=True)
+        for name in ("config.json", "README.md"):
+            (cached / text / name).write_text(text)
+            (cached / text / name).chmod(0o444)
+            (folder / name).unlink(missing_ok=True)
+            (folder / name).symlink_to(cached / text / name)
+        again.ran(["grade"], minutes)
+        publish(again.params)
+        (last,) = [
+            run
+            for run in runs("variant")
+            if run.data.tags["mlflow.parentRunId"] == runs("reproduction")[-1].info.run_id
+        ]
+        for name in ("config.json", "README.md"):
+            copy = Path(mlflow.artifacts.download_artifacts(f"{last.info.artifact_uri}/package/{name}"))
+            assert (copy.is_symlink(), copy.read_text()) == (False, text)
