@@ -558,9 +558,9 @@ def main() -> None:
     try:
         app()
     except Exception as error:
-        from pipeline.core.stage import disk_error
+        from pipeline.core.stage import system_error
 
-        if (line := str(error) if isinstance(error, UserError) else disk_error(error)) is None:
+        if (line := str(error) if isinstance(error, UserError) else system_error(error)) is None:
             raise
         typer.echo(f"octopi: {line}", err=True)
         raise SystemExit(1) from None

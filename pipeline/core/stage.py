@@ -63,17 +63,16 @@ def matrix_key(**axes: Iterable[Any] | None) -> list[Any]:
 
     Too few or too many values, or one that an axis lacks, end the process with one line and status 1.
     """
-    script, given, values = Path(sys.argv[0]), sys.argv[1:], []
-    usage = f"python stages/{script.name} {' '.join(f'<{axis}>' for axis in axes)}"
-    if len(given) != len(axes):
-        sys.exit(f"{script.stem}: {len(given)} values instead of {len(axes)}; call it as {usage}")
-    for word, (axis, known) in zip(given, axes.items(), strict=True):
-        allowed = {str(value): value for value in known or ([int(word)] if word.isdecimal() else [])}
-        if word not in allowed:
-            names = ", ".join(allowed) or "0, 1, 2, ..."
-            sys.exit(f"{script.stem}: {axis} is {word!r}; allowed: {names}; call it as {usage}")
-        values.append(allowed[word])
-    return values
+    script, given = Path(sys.argv[0]), sys.argv[1:]
+    seeds = {word: int(word) for word in given if word.isdecimal()}
+    known = [seeds if values is None else {str(value): value for value in values} for values in axes.values()]
+    if len(given) == len(known) and all(word in values for word, values in zip(given, known, strict=True)):
+        return [values[word] for word, values in zip(given, known, strict=True)]
+    takes = (
+        f"<{axis}: {', '.join(map(str, ['0', '1', '...'] if values is None else values))}>"
+        for axis, values in axes.items()
+    )
+    sys.exit(f"{script.stem}: not {' '.join(given)!r}; call it as python stages/{script.name} {' '.join(takes)}")
 
 
 def launch(launcher: str) -> None:
@@ -146,11 +145,9 @@ def stage(name: str, key: str | None = None, *, launched: bool = False) -> Itera
     except UserError as error:
         sys.exit(f"{full}: {error}")
     except Exception as error:
-        if isinstance(error, MemoryError) or any(words in str(error) for words in NO_MEMORY):
-            sys.exit(f"{full}: out of memory; lower the batch sizes in params.yaml")
-        if (refused := disk_error(error)) is None:
+        if (line := system_error(error)) is None:
             raise
-        sys.exit(f"{full}: {refused}")
+        sys.exit(f"{full}: {line}")
 
 
 def _read_by(name: str, params: Params) -> dict[Path, str]:
@@ -161,27 +158,22 @@ def _read_by(name: str, params: Params) -> dict[Path, str]:
 
 NO_MEMORY = ("out of memory", "can't allocate memory", "CUBLAS_STATUS_ALLOC_FAILED")
 """How torch says it, on a GPU and on a processor: by a RuntimeError."""
-FULL_BELOW = 64 * 2**20
-"""Free bytes below which a disk counts as full where a library does not say why it could not write."""
 
 
-def disk_error(error: Exception) -> str | None:
+def system_error(error: Exception) -> str | None:
     """One line for what the operating system refused, in whichever library's words; None for any other error."""
     number, said = error.errno if isinstance(error, OSError) else None, str(error)
+    if isinstance(error, MemoryError) or any(words in said for words in NO_MEMORY):
+        return "out of memory; lower the batch sizes in params.yaml"
     # How safetensors ends what the operating system said.
     if found := re.search(r"\(os error (\d+)\)", said):
         number = int(found[1])
     # Torch says that it could not write a file, and not why.
-    elif number is None and ("iostream error" in said or "PytorchStreamWriter failed" in said):
-        number = errno.ENOSPC if shutil.disk_usage(".").free < FULL_BELOW else errno.EIO
-    if number is None:
-        return None
+    elif "iostream error" in said or "PytorchStreamWriter failed" in said:
+        number = number or errno.EIO
     where = getattr(error, "filename", None) or f"{DATA}/ or {CHECKPOINTS}/"
-    if number in (errno.ENOSPC, errno.EDQUOT):
-        return f"no space left on the disk ({where}); free some and run again"
-    if number in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return f"{where}: {os.strerror(number)}; make it readable and writable, and run again"
-    return f"{where}: {os.strerror(number)}; mend that and run again"
+    mend = "free space on the disk, or make it readable and writable, and run again"
+    return None if number is None else f"{where}: {os.strerror(number)}; {mend}"
 
 
 def running_stages() -> list[str]:
@@ -220,14 +212,12 @@ def _main_process() -> bool:
 
 def _write_run(running: Stage) -> None:
     """Write runs/NAME.json: times, seconds, device, most memory in MiB (a GPU's, if one was used), metrics, outputs."""
+    import resource
+
     import psutil
 
-    peak = 0.0
-    if sys.platform != "win32":
-        import resource
-
-        unit = 1 if sys.platform == "darwin" else 1024
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
+    unit = 1 if sys.platform == "darwin" else 1024
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
     device, torch = f"{processor()}, {cores()} cores", sys.modules.get("torch")
     if torch is not None and torch.cuda.is_initialized() and (most := torch.cuda.max_memory_allocated()):
         device, peak = torch.cuda.get_device_name(), most / 2**20
