@@ -4,7 +4,6 @@ VENV := .venv
 BIN := $(CURDIR)/$(VENV)/bin
 PORT ?= 5000
 KILLS ?= 60
-MINUTES ?= 20
 SEED ?= 0
 DONE := $(VENV)/.installed
 # Scripts in .venv name the folder, as this file does: where it was moved, everything is installed anew.
@@ -51,8 +50,8 @@ test-fast: install  ## a minute: no chain, nothing that starts processes or trai
 stability: install  ## hard cases in every number format, into reports/stability.csv
 	python -m pytest tests/numerics --stability-csv reports/stability.csv; status=$$?; octopi page && exit $$status
 
-drill: install  ## bad inputs, kills: what is lost, into reports/drill.csv
-	python -m tests.drill --kills $(KILLS) --minutes $(MINUTES) --seed $(SEED)
+drill: install  ## kills of the chain: nothing may be lost, different or left running; KILLS=, SEED=
+	KILLS=$(KILLS) SEED=$(SEED) python -m pytest tests/chain/test_chain.py -k killed
 
 lint: install  ## ruff and mypy
 	ruff check .
