@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from importlib.util import find_spec
-from multiprocessing.connection import wait
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -114,7 +114,7 @@ def _in_processes(work: Callable[[J], R], jobs: Sequence[J], label: str) -> Iter
     the caller's script needs a main guard.
     """
     context = multiprocessing.get_context("fork" if sys.platform == "linux" else None)
-    workers, found, taken = dict[Any, Any](), dict[int, tuple[Any, Exception | None]](), context.Value("q")
+    workers, found, taken = dict[Connection, Any](), dict[int, Any](), context.Value("q")
     # Workers inherit the blocked SIGINT, so that on Ctrl-C only this process reacts, and ends them.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -126,13 +126,14 @@ def _in_processes(work: Callable[[J], R], jobs: Sequence[J], label: str) -> Iter
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         for number, job in enumerate(jobs):
             while number not in found:
-                for pipe in wait(list(workers)):
+                ready: Any = wait(workers)
+                for pipe in ready:
                     try:
                         done, *found[done] = pipe.recv()
                     except (EOFError, OSError):
                         raise _died(label, job) from None
             result, error = found.pop(number)
-            if error:
+            if error is not None:
                 raise error
             yield result
     finally:
@@ -143,7 +144,7 @@ def _in_processes(work: Callable[[J], R], jobs: Sequence[J], label: str) -> Iter
             worker.join()
 
 
-def _take(parent: int, work: Callable[[J], R], jobs: Sequence[J], taken: Any, pipe: Any) -> None:
+def _take(parent: int, work: Callable[[J], R], jobs: Sequence[J], taken: Any, pipe: Connection) -> None:
     """What a worker does until it is ended: take the next job, and hand over its number, result and error."""
     end_with_parent(parent)
     while True:
