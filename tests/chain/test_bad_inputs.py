@@ -70,7 +70,7 @@ def contents() -> dict[Path, bytes]:
 
 
 NOT_THERE = "(no such file|does not exist).*dvc repro"
-STAGES = ("split.py", "audit.py", "questions.py", "cross_validate.py constant", "grade.py", "finetune_encoder.py 0")
+STAGES = ("split.py", "audit.py", "questions.py", "grade.py", "finetune_encoder.py 0")
 STAGES += ("embed.py", "align.py finetuned all 0", "report.py", "lora.py finetuned all 0", "package.py")
 STAGES += ("answer.py finetuned with all 0",)
 COMMANDS = {
@@ -84,7 +84,6 @@ COMMANDS = {
     "stages/align.py nonsense all 0": "nonsense all 0.*python stages/align.py <encoder: finetuned, base",
     "stages/lora.py finetuned all": "finetuned all'.*<opd: none, needed, all> <seed: 0, 1, ...>",
     "stages/finetune_encoder.py -1": "-1.*python stages/",
-    "stages/cross_validate.py backbone-0": "backbone-0.*python stages/.* <model: constant, backbone, ",
     **dict.fromkeys((f"stages/{stage}" for stage in STAGES), NOT_THERE),
     "weights gpt": "smollm2",
     "publish": "dvc.lock: no such file",
