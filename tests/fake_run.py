@@ -43,7 +43,7 @@ from tests.models import model_folder
 def fake_params(*overrides: str) -> Params:
     """The smoke scale with overrides; the catalogue is this repository's."""
     here = f"data.catalogue='{ROOT / 'pipeline' / 'physiclear'}'"
-    return compose("smoke", [here, *overrides], conf=ROOT / "conf")
+    return compose("smoke", [here, "kernels=machine", *overrides], conf=ROOT / "conf")
 
 
 def write_run(root: Path, params: Params, *, objects: Sequence[str] = (), skill: float = 0.6) -> Params:

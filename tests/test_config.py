@@ -93,7 +93,7 @@ def test_wrong_override_is_one_line_with_key_and_mend(overrides: list[str], word
 
 @pytest.mark.parametrize("text", [b"\xff\xfes", None])
 def test_a_broken_params_file_is_written_anew(text: bytes | None, tmp_path: Path) -> None:
-    """Whatever stands there, by the command that the line of its refusal names; tests/chain/test_bad_inputs.py has the lines."""
+    """Whatever stands there, by the command that the line of its refusal names; tests/chain has the lines."""
     path = tmp_path / "params.yaml"
     if text is not None:
         path.write_bytes(text)

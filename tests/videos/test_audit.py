@@ -78,7 +78,12 @@ def test_no_folder_or_an_empty_one_is_an_error_beside_the_labels(tmp_path: Path,
 @pytest.fixture
 def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """What the stage reads: parameters, measurements, a split, and files that only have to have names."""
-    overrides = ["data.source=videos", "data.dir=videos", f"data.catalogue='{ROOT / 'pipeline/physiclear'}'"]
+    overrides = [
+        "kernels=machine",
+        "data.source=videos",
+        "data.dir=videos",
+        f"data.catalogue='{ROOT / 'pipeline/physiclear'}'",
+    ]
     write_params(compose("smoke", overrides, ROOT / "conf"), tmp_path / "params.yaml")
     (tmp_path / "videos").mkdir()
     monkeypatch.chdir(tmp_path)
