@@ -9,7 +9,7 @@ from pathlib import Path
 
 from benchmarks.figures import draw
 from benchmarks.table import CSV, Row, merge
-from pipeline.core.errors import UserError
+from pipeline.running.errors import UserError
 
 SECTIONS = ("frames", "encoder", "contact", "systems", "serving", "training")
 """Modules beside this one with a `measure(root)` that gives rows. Another section is a module and its name here."""

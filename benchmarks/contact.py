@@ -14,8 +14,8 @@ import numpy as np
 from benchmarks.table import Row, machine, make_rows, mean_of, timed
 from pipeline.config import ScenesConfig
 from pipeline.config.params import load_params
-from pipeline.core.parallel import run_parallel
 from pipeline.core.runtime import derive_seed
+from pipeline.running.parallel import run_parallel
 from pipeline.scenes.light import Image, make_sensor
 from pipeline.scenes.recipe import Recipe, load_recipes
 from pipeline.scenes.render import make_scene, render

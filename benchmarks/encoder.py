@@ -17,9 +17,9 @@ from benchmarks.classifier import heads_error
 from benchmarks.frames import bench_videos
 from benchmarks.table import WRONG, Row, machine, make_rows, timed
 from pipeline.config import PRETRAINED, FramesConfig
-from pipeline.core.errors import UserError
 from pipeline.encoder.data import ClipDataset, LabelledVideo
 from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.running.errors import UserError
 from pipeline.training.trainable import load_trainable
 from pipeline.videos.frames.extract import extract_frames
 from pipeline.videos.frames.store import FrameStore

@@ -16,8 +16,8 @@ from benchmarks.classifier import features, heads_error, weights
 from benchmarks.table import WRONG, Row, machine, make_rows, timed
 from pipeline.config import FramesConfig
 from pipeline.config.params import load_params
-from pipeline.core.errors import UserError
-from pipeline.core.parallel import run_parallel
+from pipeline.running.errors import UserError
+from pipeline.running.parallel import run_parallel
 from pipeline.training.sampling import sample_evaluation
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.files import VideoFile, list_videos

@@ -13,11 +13,12 @@ from typing import TypeVar
 import numpy as np
 from pydantic import Field, ValidationError
 
-from pipeline.core.errors import UserError, first_problem
 from pipeline.core.io import write_csv
-from pipeline.core.records import Record, ScoreRow
+from pipeline.core.records import Record
 from pipeline.core.runtime import cores, processor
 from pipeline.evaluation.intervals import accuracy_interval
+from pipeline.evaluation.rows import ScoreRow
+from pipeline.running.errors import UserError, first_problem
 
 CSV = Path("reports") / "speed_error.csv"
 WRONG = "share of videos of unseen objects of which not every property is right"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from benchmarks.table import Row, make_rows
 from pipeline.config.params import load_params
-from pipeline.core.errors import UserError
+from pipeline.running.errors import UserError
 from pipeline.tracking.chain import ChainStage, read_stages
 
 ENCODER, LANGUAGE = "training an encoder", "training a language model"

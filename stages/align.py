@@ -3,10 +3,11 @@
 import shutil
 
 from pipeline.core.io import read_table, write_json, write_table
-from pipeline.core.records import Assignment, Encoder, Measurement, Opd
-from pipeline.core.stage import DATA, matrix_key, stage
+from pipeline.core.records import Encoder, Measurement, Opd
+from pipeline.language.start import OBJECTS_FILE, objects_met
+from pipeline.running.stage import DATA, matrix_key, stage
 from pipeline.tracking.live import live
-from pipeline.weights import OBJECTS_FILE, objects_met
+from pipeline.videos.records import Assignment
 
 if __name__ == "__main__":
     encoder, opd, seed = matrix_key(encoder=Encoder, opd=Opd, seed=None)

@@ -4,19 +4,19 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipeline.core.io import read_jsonl, write_jsonl
-from pipeline.core.parallel import device_here
 from pipeline.core.records import Encoder, Lora, Opd, Question, Touch, Variant
 from pipeline.core.runtime import name_dtype
-from pipeline.core.stage import DATA, matrix_key, stage
+from pipeline.running.parallel import device_here
+from pipeline.running.stage import DATA, matrix_key, stage
 from pipeline.videos.catalogue import load_catalogue
 
 if __name__ == "__main__":
     variant = Variant(*matrix_key(encoder=Encoder, lora=Lora, opd=Opd, seed=None))
     with stage("answer", variant.key) as run:
-        from pipeline.core.embeddings import EmbeddingStore
         from pipeline.language.classes import in_words
         from pipeline.language.generate import ModelSource, answer
         from pipeline.language.input_ablation import ablate_input
+        from pipeline.training.embeddings import EmbeddingStore
 
         params, language = run.params, run.params.language
         store = EmbeddingStore(DATA / "embeddings" / f"{variant.encoder}-{variant.seed}")

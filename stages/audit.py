@@ -3,9 +3,9 @@
 from pathlib import Path
 
 from pipeline.core.io import read_table, write_csv, write_text
-from pipeline.core.records import Finding, Probe
-from pipeline.core.stage import DATA, stage
+from pipeline.running.stage import DATA, stage
 from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.records import Finding, Probe
 from pipeline.videos.split import read_splits
 
 if __name__ == "__main__":

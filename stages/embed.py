@@ -8,11 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipeline.core.io import fingerprint, read_table, save_tensors, write_table
-from pipeline.core.parallel import device_here
-from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Assignment, Embedding, Encoder, Part
-from pipeline.core.stage import DATA, Stage, stage
+from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Embedding, Encoder, Part
+from pipeline.running.parallel import device_here
+from pipeline.running.stage import DATA, Stage, stage
 from pipeline.videos.catalogue import load_catalogue
-from pipeline.weights import check_encoder
+from pipeline.videos.records import Assignment
+from pipeline.weights.backbones import check_encoder
 
 
 def embed(run: Stage, videos: Sequence[Assignment], state: Path | None) -> tuple[torch.Tensor, list[Embedding]]:
@@ -45,8 +46,8 @@ if __name__ == "__main__":
     with stage("embed") as run:
         import torch
 
-        from pipeline.core.embeddings import STATISTICS_FILE
         from pipeline.encoder.embed import EncoderSource, embed_videos, logits_of, standardize, statistics, union
+        from pipeline.training.embeddings import STATISTICS_FILE
 
         params = run.params
         check_encoder(Path(params.encoder.weights), params.frames.pixels, params.encoder.backbone)

@@ -3,10 +3,10 @@
 from pathlib import Path
 
 from pipeline.core.io import write_table
-from pipeline.core.records import Video
 from pipeline.core.runtime import CHECKPOINTS
-from pipeline.core.stage import DATA, stage
+from pipeline.running.stage import DATA, stage
 from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.records import Video
 
 if __name__ == "__main__":
     with stage("extract_frames") as run:

@@ -3,12 +3,14 @@
 from pathlib import Path
 
 from pipeline.core.io import read_table, write_table
-from pipeline.core.records import Assignment, Classification, Measurement, Part
+from pipeline.core.records import Measurement, Part
 from pipeline.core.runtime import resolve_device
-from pipeline.core.stage import DATA, matrix_key, stage
+from pipeline.encoder.records import Classification
+from pipeline.running.stage import DATA, matrix_key, stage
 from pipeline.tracking.live import live
 from pipeline.videos.catalogue import load_catalogue
-from pipeline.weights import backbone_files, check_encoder
+from pipeline.videos.records import Assignment
+from pipeline.weights.backbones import backbone_files, check_encoder
 
 if __name__ == "__main__":
     (seed,) = matrix_key(seed=None)

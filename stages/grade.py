@@ -3,8 +3,9 @@
 from pathlib import Path
 
 from pipeline.core.io import read_jsonl, write_table
-from pipeline.core.records import Graded, GradedVision, Prediction, Question
-from pipeline.core.stage import DATA, stage
+from pipeline.core.records import Prediction, Question
+from pipeline.evaluation.records import Graded, GradedVision
+from pipeline.running.stage import DATA, stage
 from pipeline.videos.catalogue import load_catalogue
 
 if __name__ == "__main__":

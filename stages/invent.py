@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from pipeline.config import INVENTED
-from pipeline.core.stage import stage
+from pipeline.running.stage import stage
 
 if __name__ == "__main__":
     with stage("invent") as run:

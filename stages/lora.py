@@ -2,7 +2,7 @@
 
 from pipeline.core.io import write_table
 from pipeline.core.records import Encoder, Measurement, Opd
-from pipeline.core.stage import DATA, matrix_key, stage
+from pipeline.running.stage import DATA, matrix_key, stage
 from pipeline.tracking.live import live
 
 if __name__ == "__main__":

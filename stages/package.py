@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from pipeline.core.stage import DATA, stage
+from pipeline.running.stage import DATA, stage
 
 MODELS = Path("models")
 

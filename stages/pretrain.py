@@ -3,7 +3,7 @@
 from pipeline.config import PRETRAINED
 from pipeline.core.io import write_table
 from pipeline.core.records import Measurement
-from pipeline.core.stage import DATA, stage
+from pipeline.running.stage import DATA, stage
 from pipeline.tracking.live import live
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 import logging
 from pathlib import Path
 
-from pipeline.core.stage import stage
+from pipeline.running.stage import stage
 from pipeline.tracking.publish import publish
 from pipeline.tracking.store import TrackingError
 

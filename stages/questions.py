@@ -3,11 +3,12 @@
 from pathlib import Path
 
 from pipeline.core.io import read_table, write_jsonl
-from pipeline.core.records import Assignment, Part
-from pipeline.core.stage import DATA, stage
+from pipeline.core.records import Part
+from pipeline.running.stage import DATA, stage
 from pipeline.tasks.examples import build_examples
 from pipeline.tasks.questions import build_questions, counts_by_task, pool_of
 from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.records import Assignment
 
 if __name__ == "__main__":
     with stage("questions") as run:

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from pipeline.core.stage import stage
+from pipeline.running.stage import stage
 
 if __name__ == "__main__":
     with stage("report") as run:

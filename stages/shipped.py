@@ -1,9 +1,10 @@
 """Ask the model that is shipped about this run's videos, all of which are new to it."""
 
 from pipeline.core.io import read_table, write_table
-from pipeline.core.records import GradedVision, Shown, Video
 from pipeline.core.runtime import limit_threads
-from pipeline.core.stage import DATA, stage
+from pipeline.evaluation.records import GradedVision, Shown
+from pipeline.running.stage import DATA, stage
+from pipeline.videos.records import Video
 
 if __name__ == "__main__":
     with stage("shipped") as run:

@@ -4,9 +4,10 @@ import logging
 from pathlib import Path
 
 from pipeline.core.io import read_table, write_table
-from pipeline.core.records import Assignment, Part, Video
-from pipeline.core.stage import DATA, stage
+from pipeline.core.records import Part
+from pipeline.running.stage import DATA, stage
 from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.records import Assignment, Video
 from pipeline.videos.split import assign, assign_objects, untested
 
 if __name__ == "__main__":

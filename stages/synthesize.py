@@ -4,7 +4,7 @@ from pathlib import Path
 
 from pipeline.config import SCENES_DIR
 from pipeline.core.io import write_csv
-from pipeline.core.stage import stage
+from pipeline.running.stage import stage
 from pipeline.videos.catalogue import load_catalogue
 
 if __name__ == "__main__":

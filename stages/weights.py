@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from pipeline.core.stage import stage
+from pipeline.running.stage import stage
 from pipeline.weights import MADE_DIR, made
 from pipeline.weights.make import make
 

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.config import ScenesConfig
-from pipeline.core.records import Assignment, Finding, Part, Probe, Severity
+from pipeline.core.records import Part
 from pipeline.core.runtime import derive_seed
 from pipeline.scenes.light import make_sensor
 from pipeline.scenes.recipe import recipe_of
 from pipeline.scenes.render import make_scene, render
 from pipeline.videos.audit.leakage import check_leakage
 from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.records import Assignment, Finding, Probe, Severity
 from tests.closure import ROOT
 from tests.frame_rules import scanned
 

@@ -24,9 +24,11 @@ import psutil
 import pytest
 from hypothesis import HealthCheck, settings
 
-from pipeline.core.errors import UserError
-from pipeline.core.records import Classification, Part, Video
+from pipeline.core.records import Part
+from pipeline.encoder.records import Classification
+from pipeline.running.errors import UserError
 from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.records import Video
 
 if TYPE_CHECKING:
     import torch

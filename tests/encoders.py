@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 
 from pipeline.config import PRETRAINED, EncoderConfig, Recipe, RuntimeConfig
 from pipeline.core.io import write_table
-from pipeline.core.records import Assignment, Frame, Part
+from pipeline.core.records import Part
 from pipeline.encoder.data import EncoderData
 from pipeline.encoder.finetune import Training
 from pipeline.encoder.frame_classifier import FittedHeads
@@ -20,6 +20,7 @@ from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.training.trainable import save_trainable
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FRAMES_FILE, REFERENCES_FILE, TABLE_FILE, FrameStore
+from pipeline.videos.records import Assignment, Frame
 from tests.checkpoints import write_clip
 
 Floats = np.ndarray

@@ -12,27 +12,15 @@ from safetensors.numpy import save_file
 
 from pipeline.config import Params
 from pipeline.core.io import write_csv, write_jsonl, write_table
-from pipeline.core.records import (
-    INDEX_FILE,
-    TENSOR,
-    TENSOR_FILE,
-    Assignment,
-    Classification,
-    Embedding,
-    Finding,
-    Graded,
-    Measurement,
-    Part,
-    Prediction,
-    Question,
-    Severity,
-    Video,
-)
+from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Embedding, Measurement, Part, Prediction, Question
+from pipeline.encoder.records import Classification
 from pipeline.evaluation.grading import grade
+from pipeline.evaluation.records import Graded
 from pipeline.scales import compose
 from pipeline.tasks.examples import build_examples
 from pipeline.tasks.questions import build_questions, counts_by_task, pool_of
 from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.records import Assignment, Finding, Severity, Video
 from pipeline.videos.split import assign
 from pipeline.weights import is_random
 from tests.closure import ROOT

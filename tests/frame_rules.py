@@ -17,7 +17,6 @@ import numpy as np
 from PIL import Image as Pillow
 
 from pipeline.config import FramesConfig
-from pipeline.core.records import Probe
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.decoding import Decoder, picture, planes
 from pipeline.videos.files import VideoFile
@@ -25,6 +24,7 @@ from pipeline.videos.frames.extract import Extraction, extract_frames
 from pipeline.videos.frames.probe import probe
 from pipeline.videos.frames.scan import Scan, scan
 from pipeline.videos.frames.selection import Kept
+from pipeline.videos.records import Probe
 
 CONFIG = FramesConfig(pixels=16)
 FILES = ("frames.npy", "references.npy", "frames.parquet", "probes.parquet")

@@ -11,13 +11,13 @@ from pydantic import ValidationError
 
 from pipeline.config import TrackingConfig
 from pipeline.config.params import load_params
-from pipeline.core.errors import UserError, without_secrets
 from pipeline.core.io import write_json
 from pipeline.encoder.recipes import RECIPES
+from pipeline.language.start import objects_met
+from pipeline.running.errors import UserError, without_secrets
 from pipeline.scales import check_inputs, compose, prune, scale_names, write_params
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.split import assign_objects
-from pipeline.weights import objects_met
 from tests.closure import ROOT
 from tests.conftest import refused
 

@@ -18,8 +18,10 @@ from pipeline.core.io import (
     write_jsonl,
     write_table,
 )
-from pipeline.core.records import Assignment, Measurement, Part, Score, Video
+from pipeline.core.records import Measurement, Part
 from pipeline.core.runtime import name_dtype, resolve_dtype
+from pipeline.tasks.records import Score
+from pipeline.videos.records import Assignment, Video
 from tests.conftest import refused
 
 SCORE = Score(

@@ -9,10 +9,10 @@ import pytest
 from tests.closure import ROOT, imported
 
 CORE = (
-    *("__init__", "core.__init__", "core.errors", "core.records", "core.runtime", "core.io", "config", "core.parallel"),
-    *("core.card", "core.embeddings", "weights", "training", "core.stage"),
+    *("__init__", "running.__init__", "running.errors", "running.progress", "core", "config", "running.parallel"),
+    *("weights", "training", "running.stage"),
 )
-"""What the rooms share; of core/ file by file."""
+"""What the rooms share; of running/ file by file."""
 ROOMS = ("videos", "scenes", "tasks", "encoder", "language", "evaluation", "report", "tracking", "use")
 TOP = ("scales", "cli")
 ORDER = (*CORE, *ROOMS, *TOP)
@@ -20,9 +20,9 @@ MODULES = sorted((ROOT / "pipeline").rglob("*.py"))
 
 
 def room(file: Path) -> str | None:
-    """The room of a project file, of core/ the file itself, or None outside pipeline/."""
+    """The room of a project file, of running/ the file itself, or None outside pipeline/."""
     top, *parts = file.relative_to(ROOT).with_suffix("").parts
-    return None if top != "pipeline" else ".".join(parts) if parts[0] == "core" else parts[0]
+    return None if top != "pipeline" else ".".join(parts) if parts[0] == "running" else parts[0]
 
 
 def test_what_is_listed_is_there_once() -> None:

@@ -21,7 +21,7 @@ import yaml
 
 from pipeline.config import FramesConfig
 from pipeline.core.io import atomic_folder
-from pipeline.core.stage import stage
+from pipeline.running.stage import stage
 from pipeline.scales import compose, write_params
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.extract import extract_frames
@@ -35,9 +35,9 @@ stages:
 """
 IMPORTING = "import pipeline\nprint('now', flush=True)\ntime.sleep(600)"
 RUNNING = (
-    "from pipeline.core.stage import stage\nwith stage('slow'):\n    print('now', flush=True)\n    time.sleep(600)"
+    "from pipeline.running.stage import stage\nwith stage('slow'):\n    print('now', flush=True)\n    time.sleep(600)"
 )
-WORKERS = "from pipeline.core.parallel import run_parallel\n"
+WORKERS = "from pipeline.running.parallel import run_parallel\n"
 SLEEPING = f"{WORKERS}print('now', flush=True)\nlist(run_parallel(time.sleep, [600] * 64, '', ''))"
 # So much to hand over that a worker is always in the middle of it.
 TELLING = (
@@ -135,8 +135,8 @@ def test_a_stage_runs_the_code_beside_it_or_refuses(tmp_path: Path) -> None:
 STARTED = """
 import os, sys, time
 from pathlib import Path
-from pipeline.core.errors import UserError
-from pipeline.core.stage import stage
+from pipeline.running.errors import UserError
+from pipeline.running.stage import stage
 with stage("align", "x", launched=True) as run:
     Path("started").write_text(str(os.getpid()))
     while sys.argv[1] == "waits":
@@ -251,10 +251,10 @@ def test_any_path_is_printed(tmp_path: Path) -> None:
 SCRIPT = """
 import os, sys, time
 from pathlib import Path
-from pipeline.core import parallel
+from pipeline.running import parallel
 from pipeline.config import FramesConfig
-from pipeline.core.errors import UserError
-from pipeline.core.parallel import run_parallel, use_backend
+from pipeline.running.errors import UserError
+from pipeline.running.parallel import run_parallel, use_backend
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.extract import extract_frames
 
@@ -297,12 +297,13 @@ MODELS = """
 from pathlib import Path
 from types import SimpleNamespace
 import ray, torch
-from pipeline.core.embeddings import EmbeddingStore
+from pipeline.training.embeddings import EmbeddingStore
 from pipeline.encoder.embed import EncoderSource, embed_videos
 from pipeline.core.io import read_table
 from pipeline.language import generate
-from pipeline.core.parallel import use_backend
-from pipeline.core.records import Assignment, Encoder, Lora, Opd, Variant
+from pipeline.running.parallel import use_backend
+from pipeline.core.records import Encoder, Lora, Opd, Variant
+from pipeline.videos.records import Assignment
 from tests.use.shared import make
 
 def main():

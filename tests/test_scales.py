@@ -13,9 +13,9 @@ from torch import nn
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.core.errors import UserError
 from pipeline.core.records import Part
 from pipeline.language.octopi import OctopiForCausalLM
+from pipeline.running.errors import UserError
 from pipeline.scales import compose
 from pipeline.scales.cost import costs, disk, embedded
 from pipeline.scales.memory import GIB, Use, count, launched, read_shapes, trained_parameters

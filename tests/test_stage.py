@@ -14,12 +14,12 @@ from filelock import FileLock
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.core import parallel
-from pipeline.core.errors import UserError
-from pipeline.core.parallel import _loaded, _there, use_backend
 from pipeline.core.records import Encoder, Lora, Measurement, Opd, Variant
-from pipeline.core.stage import running_stages, stage
 from pipeline.encoder.embed import EncoderSource
+from pipeline.running import parallel
+from pipeline.running.errors import UserError
+from pipeline.running.parallel import _loaded, _there, use_backend
+from pipeline.running.stage import running_stages, stage
 from pipeline.scales import check_inputs, compose, write_params
 from tests.closure import ROOT
 from tests.conftest import refused

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
 import typer
 from typer.core import TyperGroup
 
-from pipeline.core.errors import UserError, counted
+from pipeline.running.errors import UserError, counted
 
 if TYPE_CHECKING:
-    from pipeline.core.records import Finding
     from pipeline.use.model import Octopi
+    from pipeline.videos.records import Finding
 
 
 class Commands(TyperGroup):
@@ -60,7 +60,7 @@ def scale(
 ) -> None:
     """Choose what `dvc repro` runs: write params.yaml from conf/NAME.yaml and the overrides."""
     from pipeline.config.params import in_project
-    from pipeline.core.stage import running_stages
+    from pipeline.running.stage import running_stages
     from pipeline.scales import check_inputs, compose, prune, write_params
     from pipeline.scales.cost import costs
     from pipeline.scales.memory import count, read_shapes, table
@@ -106,7 +106,7 @@ def weights(
     ] = False,
 ) -> None:
     """Make a base model as a folder of safetensors, or convert or check a downloaded one."""
-    from pipeline.core.runtime import quiet_libraries
+    from pipeline.running.progress import quiet_libraries
     from pipeline.weights import DOWNLOADED, MADE
     from pipeline.weights.make import make
     from pipeline.weights.published import SUMS, adopt, new_folder
@@ -174,9 +174,9 @@ def audit(
     """Measure what can be trusted: files, contact, labels, copies, sessions, leaks; status 1 where errors are found."""
     from pipeline.config import SplitConfig
     from pipeline.core.io import write_csv
-    from pipeline.core.records import Finding
     from pipeline.videos.audit.run import audit_folder
     from pipeline.videos.catalogue import load_catalogue
+    from pipeline.videos.records import Finding
 
     # Not validated: a name that no split can have is a finding, like one that this catalogue's splits do not.
     config = SplitConfig.model_construct(name=split) if split else None
@@ -253,8 +253,8 @@ def answer_with(
 ) -> None:
     """Let a model behind an endpoint answer the evaluation questions about pictures; OPENAI_API_KEY holds its key."""
     from pipeline.config.params import load_params
-    from pipeline.core.records import Shown
     from pipeline.evaluation.answer_with import ask_all
+    from pipeline.evaluation.records import Shown
 
     if folder is None and shown == "photos":
         raise UserError("DIR: name the folder with photos, as in `--input photos DIR`")
@@ -540,7 +540,8 @@ def _print_notes(notes: Sequence[str]) -> None:
 
 
 def _load(folder: Path | None, base: Path | None, device: str) -> Octopi:
-    from pipeline.core.runtime import DeviceName, quiet_libraries
+    from pipeline.core.runtime import DeviceName
+    from pipeline.running.progress import quiet_libraries
 
     if device not in get_args(DeviceName):
         raise UserError(f"--device is {device}; allowed: {', '.join(get_args(DeviceName))}")
@@ -558,7 +559,7 @@ def main() -> None:
     try:
         app()
     except Exception as error:
-        from pipeline.core.stage import system_error
+        from pipeline.running.stage import system_error
 
         if (line := str(error) if isinstance(error, UserError) else system_error(error)) is None:
             raise

@@ -19,9 +19,10 @@ from dvc.repo import Repo
 from dvc.scm import RevError
 from scmrepo.exceptions import SCMError
 
-from pipeline.core.errors import UserError, without_secrets
-from pipeline.core.records import EffectRow, Graded
+from pipeline.evaluation.records import Graded
+from pipeline.evaluation.rows import EffectRow
 from pipeline.evaluation.scores import difference, grouped, with_holm
+from pipeline.running.errors import UserError, without_secrets
 from pipeline.tasks import TASKS
 from pipeline.weights import first_words
 

@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 
 from pipeline.config.params import CHAIN, load_params
-from pipeline.core.errors import UserError
+from pipeline.running.errors import UserError
 
 INTERRUPTED = ("exited with 130", "exited with -2")
 """How DVC's error ends for a stage that Ctrl-C ended, the second where it had hardly begun or was at its end."""

@@ -12,9 +12,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from pipeline.core.errors import without_secrets
 from pipeline.core.records import Encoder, Lora, Opd, Touch, Variant
 from pipeline.core.runtime import DeviceName, DtypeName, Kernels, Quantization
+from pipeline.running.errors import without_secrets
 
 Fraction = Annotated[float, Field(gt=0, le=1)]
 Positive = Annotated[int, Field(ge=1)]
@@ -190,7 +190,7 @@ class EncoderConfig(Section):
     """`paper`: CLIP with visual prompts, three heads. `release`: the same as the published code has it. `tuned`: a
     frame classifier is fitted to any backbones' features, then trained on with their last stage (CLIP: prompts)."""
     backbone: tuple[str, ...] = Field(default=("clip",), min_length=1)
-    """Names in `pipeline.weights.BACKBONES`; of several, features stand side by side. `clip`: a ViT of
+    """Names in `pipeline.weights.backbones.BACKBONES`; of several, features stand side by side. `clip`: a ViT of
     open_clip's. `timm`: a network of timm's. `scenes`: the one that the chain pretrains (section `pretrain`)."""
     weights: str
     """Folder of `clip` in open_clip's format (open_clip_config.json and open_clip_model.safetensors), or of `timm` in

@@ -13,7 +13,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from pipeline.config import Params
-from pipeline.core.errors import UserError, did_you_mean
+from pipeline.running.errors import UserError, did_you_mean
 
 PARAMS_FILE, CHAIN, CONF = Path("params.yaml"), Path("dvc.yaml"), Path("conf")
 PACKAGE = Path(__file__).parents[1]

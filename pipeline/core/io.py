@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from pipeline.core.errors import UserError, first_problem
 from pipeline.core.records import Record
+from pipeline.running.errors import UserError, first_problem
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -20,10 +20,11 @@ from torch import nn
 from torch.nn import functional as F
 
 from pipeline.config import EncoderConfig
-from pipeline.core.errors import UserError
 from pipeline.core.io import read_json
 from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
-from pipeline.weights import CLIP_CONFIG, GET_CLIP, check_finite, first_words, frame_side
+from pipeline.running.errors import UserError
+from pipeline.weights import check_finite, first_words
+from pipeline.weights.backbones import CLIP_CONFIG, GET_CLIP, frame_side
 
 if TYPE_CHECKING:
     from open_clip.transformer import VisionTransformer

@@ -11,13 +11,15 @@ import torch
 from torch.nn import functional as F
 from torch.utils.data import DataLoader
 
-from pipeline.core.errors import UserError
-from pipeline.core.records import Assignment, Classification, Flip, Part
+from pipeline.core.records import Flip, Part
 from pipeline.core.runtime import derive_seed
 from pipeline.encoder.model import PropertyClassifier
+from pipeline.encoder.records import Classification
+from pipeline.running.errors import UserError
 from pipeline.training.sampling import EpochDataset, sample_evaluation, sample_training
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
+from pipeline.videos.records import Assignment
 
 AXES: dict[Flip, tuple[int, ...]] = {"none": (), "horizontal": (2,), "vertical": (1,), "both": (1, 2)}
 """Axes of frames x height x width that a flip reverses."""

@@ -13,19 +13,20 @@ import numpy as np
 import torch
 
 from pipeline.config import EncoderConfig
-from pipeline.core.embeddings import FLIPS, Statistics
-from pipeline.core.errors import UserError
-from pipeline.core.parallel import run_with
-from pipeline.core.records import Assignment, Embedding, Flip, Part
+from pipeline.core.records import Embedding, Flip, Part
 from pipeline.core.runtime import DeviceName, derive_seed, resolve_device
 from pipeline.encoder.data import AXES
 from pipeline.encoder.folds import Labels, deal
 from pipeline.encoder.frame_classifier import FOLDS, Clips, choose_strength, fit_frame_heads
 from pipeline.encoder.model import FrameEncoder
 from pipeline.encoder.recipes import base_encoder, property_classifier
+from pipeline.running.errors import UserError
+from pipeline.running.parallel import run_with
+from pipeline.training.embeddings import FLIPS, Statistics
 from pipeline.training.trainable import load_trainable
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.frames.store import FrameStore
+from pipeline.videos.records import Assignment
 
 ROWS_AT_ONCE = 2**16
 """Rows whose statistics are taken at a time."""

@@ -19,7 +19,6 @@ import torch
 from torch.utils.data import default_collate
 
 from pipeline.config import EncoderConfig, RuntimeConfig
-from pipeline.core.card import write_card
 from pipeline.core.records import Measurement, Part
 from pipeline.core.runtime import resolve_device, seed_everything
 from pipeline.encoder.data import ClipDataset, EncoderData, LabelledVideo, check_finite
@@ -27,10 +26,11 @@ from pipeline.encoder.frame_classifier import JointFrameClassifier, choose_stren
 from pipeline.encoder.model import PropertyClassifier, SideBySide
 from pipeline.encoder.recipes import property_classifier
 from pipeline.encoder.tuned import TrunkDataset, Trunks, run_trunks
+from pipeline.training.card import write_card
 from pipeline.training.sampling import EpochDataset
 from pipeline.training.trainable import trainable_state
 from pipeline.videos.catalogue import Catalogue
-from pipeline.weights import BACKBONES
+from pipeline.weights.backbones import BACKBONES
 
 if TYPE_CHECKING:
     from transformers import EvalPrediction, TrainerCallback

@@ -16,11 +16,11 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from pipeline.core.errors import UserError
 from pipeline.core.records import Measurement
 from pipeline.core.runtime import derive_seed
 from pipeline.encoder.folds import Labels, deal
 from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
+from pipeline.running.errors import UserError
 
 FARTHEST = 5.0
 """Standardised features are clipped to this absolute value, so that one outlier frame does not outweigh all others."""

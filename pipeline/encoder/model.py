@@ -11,7 +11,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from pipeline.config import EncoderConfig
-from pipeline.weights import BACKBONES
+from pipeline.weights.backbones import BACKBONES
 
 
 class FrameEncoder(nn.Module):

@@ -7,7 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from pipeline.config import EncoderConfig
-from pipeline.core.errors import UserError, did_you_mean
+from pipeline.running.errors import UserError, did_you_mean
 
 if TYPE_CHECKING:
     from pipeline.encoder.model import FrameEncoder, PropertyClassifier

@@ -18,8 +18,8 @@ import numpy.typing as npt
 
 from pipeline.config import FramesConfig, PretrainConfig
 from pipeline.core.io import atomic
-from pipeline.core.parallel import run_parallel
 from pipeline.core.runtime import derive_seed
+from pipeline.running.parallel import run_parallel
 from pipeline.scenes.contact import Method, press_by
 from pipeline.scenes.geometry import IMAGE_MM, heights
 from pipeline.scenes.grid import Heights

@@ -15,10 +15,11 @@ from torch import nn
 from torch.nn import functional as F
 
 from pipeline.config import EncoderConfig
-from pipeline.core.errors import UserError
 from pipeline.core.io import load_tensors
 from pipeline.encoder.model import FrameEncoder, mean_and_deviation
-from pipeline.weights import check_finite, first_words, frame_side
+from pipeline.running.errors import UserError
+from pipeline.weights import check_finite, first_words
+from pipeline.weights.backbones import frame_side
 
 STAGES = "stages.safetensors"
 """File of a packaged model that replaces the network's weights: those of the stages that are read."""

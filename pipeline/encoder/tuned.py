@@ -17,10 +17,11 @@ import torch
 
 from pipeline.config import EncoderConfig
 from pipeline.core.records import Flip
-from pipeline.core.runtime import derive_seed, track
+from pipeline.core.runtime import derive_seed
 from pipeline.encoder.data import AXES, ClipDataset, EncoderData, LabelledVideo, draw_flip
 from pipeline.encoder.frame_classifier import JointFrameClassifier
 from pipeline.encoder.model import SideBySide, load_backbones
+from pipeline.running.progress import track
 from pipeline.training.sampling import EpochDataset
 
 MEMORY = 2**30

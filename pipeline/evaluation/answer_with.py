@@ -24,12 +24,13 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.config import Params
-from pipeline.core.errors import UserError
 from pipeline.core.io import fingerprint, read_jsonl, write_json, write_jsonl
-from pipeline.core.records import Opd, Prediction, Question, Record, Shown, VisionModel
-from pipeline.core.runtime import track
-from pipeline.core.stage import DATA, alone
+from pipeline.core.records import Opd, Prediction, Question, Record
 from pipeline.evaluation.grading import EXTERNAL, SOURCE_FILE
+from pipeline.evaluation.records import Shown, VisionModel
+from pipeline.running.errors import UserError
+from pipeline.running.progress import track
+from pipeline.running.stage import DATA, alone
 from pipeline.training.sampling import sample_evaluation
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.frames.store import FrameStore, frames_key

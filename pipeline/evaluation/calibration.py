@@ -12,7 +12,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.core.records import Classification, Part, Record, Share
+from pipeline.core.records import Part, Record
+from pipeline.encoder.records import Classification
+from pipeline.evaluation.records import Share
 
 Floats = npt.NDArray[np.float64]
 

@@ -10,10 +10,13 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from pipeline.core.errors import UserError
 from pipeline.core.io import fingerprint, read_json, read_jsonl
-from pipeline.core.records import Classification, GradedVision, Prediction, Question, Score, Shown, VisionModel
+from pipeline.core.records import Prediction, Question
+from pipeline.encoder.records import Classification
+from pipeline.evaluation.records import GradedVision, Shown, VisionModel
+from pipeline.running.errors import UserError
 from pipeline.tasks import TASKS
+from pipeline.tasks.records import Score
 from pipeline.videos.catalogue import Catalogue
 
 EXTERNAL = Path("external")

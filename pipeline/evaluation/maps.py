@@ -11,8 +11,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from pipeline.core.io import read_table
-from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Assignment, Embedding
+from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Embedding
 from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.records import Assignment
 
 MAPPED = 400
 """Maximum number of videos on a map, taken evenly; exact t-SNE, equal on any processor, costs n squared."""

@@ -15,26 +15,14 @@ from typing import NamedTuple
 import numpy as np
 from statsmodels.stats.multitest import multipletests
 
-from pipeline.core.records import (
-    ALL_SEEDS,
-    HEADS,
-    RECALL,
-    VALIDATION_HEADS,
-    Classification,
-    EffectRow,
-    Encoder,
-    Graded,
-    GradedVision,
-    Lora,
-    Opd,
-    Part,
-    Score,
-    ScoreRow,
-    Touch,
-)
+from pipeline.core.records import Encoder, Lora, Opd, Part, Touch
+from pipeline.encoder.records import Classification
 from pipeline.evaluation.intervals import Objects, accuracy_interval
 from pipeline.evaluation.paired import Difference, paired
+from pipeline.evaluation.records import Graded, GradedVision
+from pipeline.evaluation.rows import ALL_SEEDS, HEADS, RECALL, VALIDATION_HEADS, EffectRow, ScoreRow
 from pipeline.tasks import TASKS
+from pipeline.tasks.records import Score
 from pipeline.videos.catalogue import Catalogue
 
 

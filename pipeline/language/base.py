@@ -14,11 +14,11 @@ import torch
 from safetensors import SafetensorError
 from transformers import AutoTokenizer, BitsAndBytesConfig, PreTrainedModel, PreTrainedTokenizerBase
 
-from pipeline.core.errors import UserError
 from pipeline.core.io import tensor_shapes
 from pipeline.core.records import Turn
 from pipeline.core.runtime import Quantization
 from pipeline.language.chat import add_tactile_tokens, render
+from pipeline.running.errors import UserError
 from pipeline.weights import again, check_finite, check_language, first_words, load_language
 
 ADAPTER_CONFIG = "adapter_config.json"

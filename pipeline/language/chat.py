@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from jinja2 import TemplateError
 
-from pipeline.core.errors import UserError
 from pipeline.core.records import Turn
+from pipeline.running.errors import UserError
 
 if TYPE_CHECKING:
     from transformers import PreTrainedTokenizerBase

@@ -8,9 +8,9 @@ from itertools import permutations
 
 import torch
 
-from pipeline.core.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
 from pipeline.core.records import Question
 from pipeline.language.conversations import without_videos
+from pipeline.training.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
 from pipeline.videos.catalogue import Catalogue
 
 

@@ -11,11 +11,11 @@ from torch.nn.utils.rnn import pad_sequence
 from torch.utils.data import Sampler
 from transformers import PreTrainedTokenizerBase
 
-from pipeline.core.embeddings import FLIPS, EmbeddingStore
-from pipeline.core.errors import UserError
 from pipeline.core.records import Opd, Question
 from pipeline.core.runtime import derive_seed
 from pipeline.language.chat import IGNORE_INDEX, TACTILE, conclusions, encode, render
+from pipeline.running.errors import UserError
+from pipeline.training.embeddings import FLIPS, EmbeddingStore
 from pipeline.training.sampling import EpochDataset, sample_evaluation, sample_training
 
 FILLER = -1

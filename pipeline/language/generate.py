@@ -12,15 +12,15 @@ import torch
 from transformers import PreTrainedTokenizerBase
 
 from pipeline.config import LanguageConfig
-from pipeline.core.embeddings import EmbeddingStore
-from pipeline.core.errors import UserError
-from pipeline.core.parallel import run_with
 from pipeline.core.records import Opd, Prediction, Question, Turn
 from pipeline.core.runtime import DeviceName, DtypeName, Quantization, resolve_device
 from pipeline.language.chat import encode, end_ids, render
 from pipeline.language.conversations import check_length, evaluation_features
 from pipeline.language.decoding import greedy, greedy_tokens
 from pipeline.language.octopi import OctopiForCausalLM
+from pipeline.running.errors import UserError
+from pipeline.running.parallel import run_with
+from pipeline.training.embeddings import EmbeddingStore
 
 
 @dataclass(frozen=True)

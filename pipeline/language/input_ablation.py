@@ -8,12 +8,12 @@ from itertools import accumulate, chain, pairwise
 
 import torch
 
-from pipeline.core.embeddings import EmbeddingStore
-from pipeline.core.errors import UserError
 from pipeline.core.records import Question, Touch
 from pipeline.core.runtime import derive_seed
 from pipeline.language.chat import TACT_END, TACT_START
 from pipeline.language.conversations import without_videos
+from pipeline.running.errors import UserError
+from pipeline.training.embeddings import EmbeddingStore
 
 
 def ablate_input(

@@ -6,8 +6,8 @@ from torch import nn
 from transformers import PreTrainedModel
 
 from pipeline.config import LoraTrainConfig
-from pipeline.core.errors import UserError
 from pipeline.language.octopi import OctopiForCausalLM
+from pipeline.running.errors import UserError
 
 
 def add_lora(model: OctopiForCausalLM, config: LoraTrainConfig) -> None:

@@ -16,13 +16,13 @@ from transformers import DynamicCache, PreTrainedModel, PreTrainedTokenizerBase
 from transformers.modeling_outputs import CausalLMOutput
 
 from pipeline.config import TrainedEmbeddings
-from pipeline.core.errors import UserError, first_problem
 from pipeline.core.io import read_json, save_tensors, write_json
 from pipeline.core.records import Record
 from pipeline.core.runtime import DtypeName, Quantization, resolve_dtype
 from pipeline.language.base import ADAPTER_CONFIG, load_adapter, load_llm, load_tokenizer
 from pipeline.language.cache import extendable
 from pipeline.language.chat import IGNORE_INDEX, TACTILE_TOKENS
+from pipeline.running.errors import UserError, first_problem
 from pipeline.training.trainable import load_trainable
 
 CONFIG_FILE, CONNECTOR_FILE, WORDS_FILE = "config.json", "connector.safetensors", "words.safetensors"

@@ -13,9 +13,6 @@ from typing import Any, Self
 from transformers import TrainerCallback
 
 from pipeline.config import LANGUAGE_DIR, LanguageConfig, LoraTrainConfig, Params, RuntimeConfig, TrainConfig
-from pipeline.core.card import write_card
-from pipeline.core.embeddings import EmbeddingStore
-from pipeline.core.errors import UserError
 from pipeline.core.io import fingerprint, read_jsonl
 from pipeline.core.records import Encoder, Opd, Question
 from pipeline.core.runtime import derive_seed, name_dtype, seed_everything
@@ -23,6 +20,9 @@ from pipeline.language.base import ADAPTER_WEIGHTS
 from pipeline.language.classes import in_words, uncontradicted
 from pipeline.language.conversations import ConversationDataset, UpdateSampler, collate
 from pipeline.language.octopi import ADAPTER_DIR, CONFIG_FILE, OctopiForCausalLM, read_config
+from pipeline.running.errors import UserError
+from pipeline.training.card import write_card
+from pipeline.training.embeddings import EmbeddingStore
 from pipeline.training.trainer import TrainableTrainer, Trained, checkpoint_dir, train, training_arguments
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 

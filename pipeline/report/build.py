@@ -14,29 +14,13 @@ import pandas as pd
 from pipeline.config import AblationConfig, Params
 from pipeline.config.params import PARAMS_FILE
 from pipeline.core.io import R, read_csv, read_jsonl, read_table, write_csv, write_json, write_text
-from pipeline.core.records import (
-    HEADS,
-    TENSOR_FILE,
-    Assignment,
-    Classification,
-    EffectRow,
-    Encoder,
-    Finding,
-    Graded,
-    GradedVision,
-    Measurement,
-    Part,
-    Prediction,
-    Question,
-    Score,
-    ScoreRow,
-    Touch,
-    Variant,
-    Video,
-)
+from pipeline.core.records import TENSOR_FILE, Encoder, Measurement, Part, Prediction, Question, Touch, Variant
+from pipeline.encoder.records import Classification
 from pipeline.evaluation.calibration import CalibrationRow, calibrated, calibration_rows
 from pipeline.evaluation.grading import EXTERNAL, conclude, vision_models
 from pipeline.evaluation.maps import map_frame, means
+from pipeline.evaluation.records import Graded, GradedVision
+from pipeline.evaluation.rows import HEADS, EffectRow, ScoreRow
 from pipeline.evaluation.scores import effect_rows, score_rows
 from pipeline.report.figures import draw_figures
 from pipeline.report.load import load_report, published
@@ -44,7 +28,9 @@ from pipeline.report.provenance import provenance
 from pipeline.report.readme import render_readme
 from pipeline.report.samples import choose_examples, choose_samples
 from pipeline.report.tables import headline, over_seeds
+from pipeline.tasks.records import Score
 from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.records import Assignment, Finding, Video
 from pipeline.videos.split import read_splits
 
 MOST_METRICS = 12

@@ -9,9 +9,9 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.core.errors import UserError
 from pipeline.core.io import read_json
-from pipeline.core.records import EffectRow, ScoreRow
+from pipeline.evaluation.rows import EffectRow, ScoreRow
+from pipeline.running.errors import UserError
 
 KEYS = ("task", "measure", "encoder", "lora", "opd")
 """Columns that join published cells to measured rows; "" stands for "does not apply"."""

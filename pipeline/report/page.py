@@ -19,12 +19,12 @@ from jinja2 import UndefinedError
 from markupsafe import Markup
 
 from pipeline.config.params import PARAMS_FILE, load_params
-from pipeline.core.errors import UserError
 from pipeline.core.io import write_text
 from pipeline.report.load import Report, load_report, published, read_frame
 from pipeline.report.readme import OTHER_MODELS, sections
 from pipeline.report.render import Block, render
 from pipeline.report.tables import TABLES, side_by_side
+from pipeline.running.errors import UserError
 
 PAGE = Path("reports/index.html")
 LARGEST = 1_500_000

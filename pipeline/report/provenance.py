@@ -15,12 +15,13 @@ import yaml
 
 from pipeline.config import EncoderConfig, Params
 from pipeline.config.params import CONF, PARAMS_FILE, compose
-from pipeline.core.card import front_matter
 from pipeline.core.io import ROOT, code_of, sha256, tensor_shapes
-from pipeline.core.records import Assignment, Part, Video
+from pipeline.core.records import Part
 from pipeline.evaluation.intervals import coverage_note
+from pipeline.training.card import front_matter
 from pipeline.videos.catalogue import Catalogue
-from pipeline.weights import BACKBONES, reads_weights
+from pipeline.videos.records import Assignment, Video
+from pipeline.weights.backbones import BACKBONES, reads_weights
 
 PACKAGES = ("torch", "transformers", "peft", "open_clip_torch", "scipy", "scikit-learn", "dvc")
 UNKNOWN = "unknown"

@@ -9,7 +9,7 @@ import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup, escape
 
-from pipeline.core.errors import counted
+from pipeline.running.errors import counted
 
 
 class Block(NamedTuple):

@@ -8,9 +8,10 @@ import re
 from collections.abc import Iterable
 from typing import Any
 
-from pipeline.core.records import Opd, Prediction, Question, Score
+from pipeline.core.records import Opd, Prediction, Question
 from pipeline.tasks import TASKS
 from pipeline.tasks.examples import EXAMPLES, LEAST_KNOWN_FIRST, grade_example
+from pipeline.tasks.records import Score
 from pipeline.videos.catalogue import Catalogue
 
 RULE = (

@@ -14,14 +14,9 @@ from typing import Any
 import pandas as pd
 import yaml
 
-from pipeline.core.records import (
-    ALL_SEEDS,
-    HEADS,
-    RECALL,
-    VALIDATION_HEADS,
-    Shown,
-    Touch,
-)
+from pipeline.core.records import Touch
+from pipeline.evaluation.records import Shown
+from pipeline.evaluation.rows import ALL_SEEDS, HEADS, RECALL, VALIDATION_HEADS
 from pipeline.report.load import DATASET, DATASETS, KEYS, Report, published
 from pipeline.report.render import Block
 from pipeline.tasks import TASKS

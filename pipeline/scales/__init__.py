@@ -12,17 +12,19 @@ import yaml
 from pipeline import weights
 from pipeline.config import Params
 from pipeline.config.params import PARAMS_FILE, compose, scale_names
-from pipeline.core.errors import UserError
 from pipeline.core.io import write_text
-from pipeline.core.parallel import check_backend
 from pipeline.core.records import Part, Touch
 from pipeline.encoder.recipes import check_recipe
+from pipeline.language.start import objects_met
+from pipeline.running.errors import UserError
+from pipeline.running.parallel import check_backend
 from pipeline.scales.memory import launched
 from pipeline.scenes.invented import catalogue_of
 from pipeline.tasks.questions import counts_by_task
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import list_videos, raise_errors
 from pipeline.videos.split import FEWEST_TRAINING_OBJECTS, assign_objects, untested
+from pipeline.weights.backbones import check_encoder
 from pipeline.weights.check import check_encoder_files, check_language_files
 
 __all__ = ["check_inputs", "check_objects", "compose", "prune", "scale_names", "write_params"]
@@ -53,7 +55,7 @@ def check_inputs(params: Params) -> str:
         raise UserError(f"scenes.objects: {unknown[0]} is not in {params.data.catalogue}/objects.csv")
     lacking = check_objects(params, catalogue)
     encoder, language = Path(params.encoder.weights), Path(params.language.weights)
-    weights.check_encoder(encoder, params.frames.pixels, params.encoder.backbone)
+    check_encoder(encoder, params.frames.pixels, params.encoder.backbone)
     check_encoder_files(encoder, params.encoder.backbone)
     weights.check_language(language, "language.weights")
     check_language_files(language, "language.weights")
@@ -74,7 +76,7 @@ def check_objects(params: Params, catalogue: Catalogue) -> str:
     for seed in params.ablation.seeds:
         parts = assign_objects(catalogue, present, params.split, seed)
         training, tested = (sorted(o for o in present if parts.get(o) == part) for part in (Part.TRAIN, Part.TEST))
-        weights.objects_met(params.language.start, {o: parts[o] for o in present if o in parts})
+        objects_met(params.language.start, {o: parts[o] for o in present if o in parts})
         fold = params.split.fold_of(seed)
         where = f"split.name={params.split.name}" + (f", fold {fold}" if fold is not None else "")
         if fold is None and (absent := untested(parts, present)):

@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from pipeline.config import Params
-from pipeline.core.embeddings import FLIPS
 from pipeline.core.records import Encoder, Part
 from pipeline.scales.memory import BYTES, Shapes, launched, trained_parameters
+from pipeline.training.embeddings import FLIPS
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import list_videos
 from pipeline.videos.frames.selection import kept_count

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import yaml
 
 from pipeline.config import Params
-from pipeline.core.errors import UserError
 from pipeline.core.records import Part
+from pipeline.running.errors import UserError
 from pipeline.scenes.invented import catalogue_of
 from pipeline.tasks.base import Pool
 from pipeline.tasks.questions import build_questions, counts_by_task

@@ -15,9 +15,9 @@ import yaml
 from pydantic import Field, ValidationError
 
 from pipeline.config.params import OneKeyLoader
-from pipeline.core.errors import UserError, first_problem
 from pipeline.core.records import Record
 from pipeline.core.runtime import derive_seed
+from pipeline.running.errors import UserError, first_problem
 from pipeline.scenes.geometry import IMAGE_MM, Body, Flat, Round
 from pipeline.scenes.relief import AnyLayer, Domes, Ridges, Rough
 from pipeline.videos.catalogue import Catalogue

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 
 from pipeline.config import ScenesConfig
-from pipeline.core.errors import UserError
 from pipeline.core.runtime import derive_seed
+from pipeline.running.errors import UserError
 from pipeline.scenes.contact import GEL, LADDER, Imprint, Method, press
 from pipeline.scenes.elastic.torsion import slip_turn, twist
 from pipeline.scenes.geometry import IMAGE_MM, heights

@@ -12,10 +12,10 @@ from typing import NamedTuple
 import cv2
 
 from pipeline.config import ScenesConfig
-from pipeline.core.errors import UserError
-from pipeline.core.parallel import run_parallel
 from pipeline.core.records import Record
 from pipeline.core.runtime import derive_seed
+from pipeline.running.errors import UserError
+from pipeline.running.parallel import run_parallel
 from pipeline.scenes.light import make_sensor
 from pipeline.scenes.recipe import Recipe
 from pipeline.scenes.render import make_scene, measure_scene, render

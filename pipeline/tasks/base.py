@@ -8,7 +8,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from pipeline.core.records import Dialogue, Gold, Opd, Part, Prediction, Question, Score, Turn
+from pipeline.core.records import Dialogue, Gold, Opd, Part, Prediction, Question, Turn
+from pipeline.tasks.records import Score
 from pipeline.videos.catalogue import Catalogue, Property
 from pipeline.videos.catalogue.wording import mentioned, plain, unmarked
 

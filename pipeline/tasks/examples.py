@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from pipeline.core.records import Assignment, Opd, Part, Prediction, Question, Score, Turn
+from pipeline.core.records import Opd, Part, Prediction, Question, Turn
 from pipeline.core.runtime import derive_seed
 from pipeline.tasks.base import (
     LETTERS,
@@ -19,7 +19,9 @@ from pipeline.tasks.base import (
     draft_about,
 )
 from pipeline.tasks.opd import TEMPLATES
+from pipeline.tasks.records import Score
 from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.records import Assignment
 
 LEAST_KNOWN_FIRST = (Part.TEST, Part.VALIDATION, Part.TRAIN)
 """The parts of a split, the least familiar to a model first."""

@@ -7,8 +7,9 @@ import random
 import re
 from string import Formatter
 
-from pipeline.core.records import Opd, Prediction, Question, Score
+from pipeline.core.records import Opd, Prediction, Question
 from pipeline.tasks.base import Classes, Draft, Pool, TaskDefinition, draft_about, find_level, scored, single_turn
+from pipeline.tasks.records import Score
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.catalogue.wording import OPENING, unmarked
 

@@ -6,9 +6,10 @@ import random
 import re
 from typing import Literal
 
-from pipeline.core.records import Dialogue, Opd, Prediction, Question, Score, Turn
+from pipeline.core.records import Dialogue, Opd, Prediction, Question, Turn
 from pipeline.tasks import base, psr
 from pipeline.tasks.base import Classes, Draft, Pool, TaskDefinition
+from pipeline.tasks.records import Score
 from pipeline.videos.catalogue import Catalogue, Property
 
 TEMPLATES = (

@@ -7,9 +7,10 @@ import random
 import re
 from collections.abc import Iterable, Sequence
 
-from pipeline.core.records import Dialogue, Opd, Prediction, Question, Score
+from pipeline.core.records import Dialogue, Opd, Prediction, Question
 from pipeline.tasks import base
 from pipeline.tasks.base import Classes, Draft, Pool, TaskDefinition
+from pipeline.tasks.records import Score
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.catalogue.wording import unmarked
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import random
 from collections.abc import Mapping, Sequence
 
-from pipeline.core.records import Opd, Prediction, Question, Score, Turn
+from pipeline.core.records import Opd, Prediction, Question, Turn
 from pipeline.tasks import base
 from pipeline.tasks.base import Classes, Draft, Pool, TaskDefinition
+from pipeline.tasks.records import Score
 from pipeline.videos.catalogue import Catalogue
 
 BASED = " based on physical property descriptions of the two objects"

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import random
 
-from pipeline.core.records import Opd, Prediction, Question, Score
+from pipeline.core.records import Opd, Prediction, Question
 from pipeline.tasks import base
 from pipeline.tasks.base import Classes, Draft, Pool, TaskDefinition
+from pipeline.tasks.records import Score
 from pipeline.videos.catalogue import Catalogue
 
 TEMPLATES = (

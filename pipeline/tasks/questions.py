@@ -10,12 +10,13 @@ from itertools import islice
 from typing import Literal
 
 from pipeline.config import QuestionsConfig
-from pipeline.core.errors import UserError, did_you_mean
-from pipeline.core.records import Assignment, Part, Question
+from pipeline.core.records import Part, Question
 from pipeline.core.runtime import derive_seed
+from pipeline.running.errors import UserError, did_you_mean
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Draft, Pool, TaskDefinition, in_turns
 from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.records import Assignment
 
 CHOICES = 2
 """Maximum number of questions of a multi-turn dialogue that are asked again in the form of a scenario question."""

@@ -8,9 +8,10 @@ from __future__ import annotations
 import random
 import re
 
-from pipeline.core.records import Opd, Prediction, Question, Score, Turn
+from pipeline.core.records import Opd, Prediction, Question, Turn
 from pipeline.tasks import base
 from pipeline.tasks.base import Draft, Pool, TaskDefinition
+from pipeline.tasks.records import Score
 from pipeline.videos.catalogue import Catalogue
 
 NUMBERS = {1: "one", 2: "two", 3: "three", 4: "four"}

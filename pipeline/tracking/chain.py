@@ -14,10 +14,11 @@ import yaml
 
 from pipeline.config import Params
 from pipeline.config.params import CHAIN, PARAMS_FILE
-from pipeline.core.errors import UserError
 from pipeline.core.io import read_json, read_table
-from pipeline.core.records import Graded, Touch, Variant
-from pipeline.core.stage import DATA, RUNS
+from pipeline.core.records import Touch, Variant
+from pipeline.evaluation.records import Graded
+from pipeline.running.errors import UserError
+from pipeline.running.stage import DATA, RUNS
 from pipeline.tasks import TASKS
 
 REPORTS, CHAIN_LOCK = Path("reports"), Path("dvc.lock")

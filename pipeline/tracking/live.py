@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from pipeline.core.stage import Stage
+from pipeline.running.stage import Stage
 from pipeline.tracking.chain import axes, read_stages, settings
 from pipeline.tracking.store import PARENT, STAGE, Store, attempt
 

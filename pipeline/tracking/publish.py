@@ -13,10 +13,10 @@ from typing import Any
 
 from pipeline.config import Params
 from pipeline.config.params import load_params
-from pipeline.core.errors import UserError
 from pipeline.core.io import read_json, read_table
 from pipeline.core.records import Encoder, Lora, Measurement, Variant
-from pipeline.core.stage import DATA
+from pipeline.running.errors import UserError
+from pipeline.running.stage import DATA
 from pipeline.tasks import TASKS
 from pipeline.tracking.chain import (
     CHAIN_LOCK,

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 from pipeline.config import Params, TrackingConfig
 from pipeline.config.params import main_folder
-from pipeline.core.errors import UserError, without_secrets
+from pipeline.running.errors import UserError, without_secrets
 from pipeline.tracking.chain import ChainStage, settings
 
 logger = logging.getLogger(__name__)

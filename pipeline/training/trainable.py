@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import nn
 
-from pipeline.core.errors import UserError
 from pipeline.core.io import load_tensors, save_tensors
+from pipeline.running.errors import UserError
 
 
 def trainable_state(module: nn.Module) -> dict[str, torch.Tensor]:

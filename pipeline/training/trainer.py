@@ -25,10 +25,11 @@ from transformers.trainer_utils import get_last_checkpoint
 from transformers.utils import SAFE_WEIGHTS_NAME
 
 from pipeline.config import EncoderConfig, PretrainConfig, RuntimeConfig, TrainConfig
-from pipeline.core.errors import UserError
 from pipeline.core.io import code_of, fingerprint
 from pipeline.core.records import Measurement
-from pipeline.core.runtime import CHECKPOINTS, LogLines, limit_threads, resolve_device
+from pipeline.core.runtime import CHECKPOINTS, limit_threads, resolve_device
+from pipeline.running.errors import UserError
+from pipeline.running.progress import LogLines
 from pipeline.training.sampling import EpochDataset
 from pipeline.training.trainable import load_trainable, whole_state
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import torch
 
-from pipeline.core.card import CARD_FILE
-from pipeline.core.embeddings import STATISTICS_FILE
-from pipeline.core.errors import UserError
 from pipeline.core.io import atomic_folder, sha256, write_json, write_text
+from pipeline.running.errors import UserError
+from pipeline.training.card import CARD_FILE
+from pipeline.training.embeddings import STATISTICS_FILE
 from pipeline.use.folder import CONFIG, ENCODER_DIR
 from pipeline.use.model import Octopi
 

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 from rich.markup import escape
 from rich.table import Column, Table
 
-from pipeline.core.errors import UserError, readable
 from pipeline.core.io import sha256, write_text
-from pipeline.core.runtime import progress
+from pipeline.running.errors import UserError, readable
+from pipeline.running.progress import progress
 from pipeline.use.results import Exchange, Video
 from pipeline.videos.decoding import SUFFIXES
 from pipeline.videos.files import video_files

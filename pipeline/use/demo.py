@@ -24,8 +24,8 @@ from pydantic import BaseModel, Field
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from pipeline.config import ScenesConfig
-from pipeline.core.errors import UserError
 from pipeline.core.records import GAIN, MIDDLE
+from pipeline.running.errors import UserError
 from pipeline.scenes.light import make_sensor
 from pipeline.scenes.recipe import Recipe, load_recipes
 from pipeline.scenes.render import make_scene, render

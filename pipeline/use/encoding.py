@@ -12,14 +12,14 @@ import numpy as np
 import torch
 
 from pipeline.config import EncoderConfig
-from pipeline.core.embeddings import STATISTICS_FILE, Statistics
-from pipeline.core.errors import UserError
 from pipeline.core.io import fingerprint
 from pipeline.core.records import Encoder
 from pipeline.encoder.embed import standardize
 from pipeline.encoder.model import FrameEncoder, PropertyClassifier
 from pipeline.encoder.recipes import base_encoder, property_classifier
 from pipeline.evaluation.calibration import rescale
+from pipeline.running.errors import UserError
+from pipeline.training.embeddings import STATISTICS_FILE, Statistics
 from pipeline.training.trainable import load_trainable
 from pipeline.use.folder import BACKBONE_DIR, CONFIG, ENCODER_DIR, SCENES, TRAINED, ModelConfig, distance
 from pipeline.use.frames import name_of, read_touch

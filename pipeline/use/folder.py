@@ -18,10 +18,10 @@ from platformdirs import user_cache_path
 from pydantic import AfterValidator, BaseModel, ValidationError
 
 from pipeline.config import EncoderConfig, FramesConfig, LanguageConfig
-from pipeline.core.errors import UserError, first_problem
 from pipeline.core.io import fingerprint, read_json, sha256
 from pipeline.core.records import Encoder, Opd, Record, Turn
 from pipeline.language.chat import render
+from pipeline.running.errors import UserError, first_problem
 from pipeline.videos.catalogue import Catalogue
 from pipeline.weights.make import PACKAGED, make
 

@@ -12,8 +12,8 @@ import av
 import numpy as np
 
 from pipeline.config import FramesConfig
-from pipeline.core.errors import UserError
-from pipeline.core.records import GAIN, MIDDLE, Finding
+from pipeline.core.records import GAIN, MIDDLE
+from pipeline.running.errors import UserError
 from pipeline.training.sampling import sample_evaluation
 from pipeline.use.results import Touch, Video
 from pipeline.videos.audit.files import FOUND, unsteady
@@ -21,6 +21,7 @@ from pipeline.videos.decoding import SUFFIXES
 from pipeline.videos.files import VideoFile, is_video
 from pipeline.videos.frames.scan import scan
 from pipeline.videos.frames.subtraction import subtract
+from pipeline.videos.records import Finding
 
 FEWEST = 2
 """Minimum number of frames in a video: contact shows as a change between frames."""

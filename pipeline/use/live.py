@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from pipeline.core.errors import UserError
+from pipeline.running.errors import UserError
 from pipeline.use.model import with_marks
 from pipeline.videos.audit.files import FOUND
 from pipeline.videos.frames.reference import LONGEST, contact_strength, mean, starts_touching

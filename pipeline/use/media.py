@@ -23,8 +23,8 @@ from pathlib import Path
 
 import av
 
-from pipeline.core.errors import UserError
-from pipeline.core.parallel import end_with_parent
+from pipeline.running.errors import UserError
+from pipeline.running.parallel import end_with_parent
 from pipeline.videos.decoding import CONTAINERS, SUFFIXES, video_stream
 
 SUFFIX = {b"RIFF": ".avi", b"\x1aE\xdf\xa3": ".mkv"}

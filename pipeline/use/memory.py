@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.core.errors import UserError
 from pipeline.core.io import read_jsonl, write_jsonl
 from pipeline.core.records import Record
+from pipeline.running.errors import UserError
 
 TOUCHES = "touches.jsonl"
 

@@ -14,21 +14,14 @@ import numpy as np
 import torch
 
 from pipeline.config import LANGUAGE_DIR, LanguageConfig
-from pipeline.core.errors import UserError, counted, did_you_mean, readable
 from pipeline.core.io import fingerprint
 from pipeline.core.records import Opd, Turn
-from pipeline.core.runtime import (
-    DeviceName,
-    DtypeName,
-    Quantization,
-    derive_seed,
-    name_dtype,
-    quiet_libraries,
-    resolve_device,
-)
+from pipeline.core.runtime import DeviceName, DtypeName, Quantization, derive_seed, name_dtype, resolve_device
 from pipeline.language.chat import TACTILE, TACTILE_TOKENS
 from pipeline.language.generate import Stream, reply, write_prompt
 from pipeline.language.octopi import OctopiForCausalLM
+from pipeline.running.errors import UserError, counted, did_you_mean, readable
+from pipeline.running.progress import quiet_libraries
 from pipeline.tasks import opd, pc, pom, psr, pss
 from pipeline.tasks.base import LETTERS
 from pipeline.use.encoding import EncodedVideo, VideoEncoder
@@ -36,7 +29,8 @@ from pipeline.use.folder import ENCODER_DIR, SHIPPED, ModelConfig, chat_sample, 
 from pipeline.use.memory import Remembered, most_similar, recall, remember
 from pipeline.use.results import Choice, Comparison, Description, Exchange, Matching, Ranking, Recognition, Touch, Video
 from pipeline.videos.catalogue import Catalogue, Object, Property
-from pipeline.weights import is_random, reads_weights
+from pipeline.weights import is_random
+from pipeline.weights.backbones import reads_weights
 
 NUMBERED = re.compile(r"object \d+")
 ALONE = "the question compares, but there is one video: what it says of another is made up"

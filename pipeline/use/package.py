@@ -11,17 +11,20 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pipeline.config import LANGUAGE_DIR, PRETRAINED, Params
-from pipeline.core.card import CARD_FILE, write_card
-from pipeline.core.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
-from pipeline.core.errors import UserError
 from pipeline.core.io import atomic_folder, read_json, read_jsonl, read_table, save_tensors, sha256, write_json
-from pipeline.core.records import Assignment, Classification, Encoder, Graded, Part, Probe, Question, Touch, Variant
+from pipeline.core.records import Encoder, Part, Question, Touch, Variant
+from pipeline.encoder.records import Classification
 from pipeline.evaluation.calibration import calibration_rows, fit_temperature
 from pipeline.evaluation.grading import conclude
+from pipeline.evaluation.records import Graded
 from pipeline.evaluation.scores import score_rows
 from pipeline.language.base import load_tokenizer
 from pipeline.language.octopi import ADAPTER_DIR, CONFIG_FILE
+from pipeline.language.start import OBJECTS_FILE
+from pipeline.running.errors import UserError
 from pipeline.tasks import TASKS
+from pipeline.training.card import CARD_FILE, write_card
+from pipeline.training.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
 from pipeline.training.sampling import sample_evaluation
 from pipeline.use.folder import (
     BACKBONE_DIR,
@@ -42,7 +45,8 @@ from pipeline.use.folder import (
 from pipeline.videos.audit.files import quiet_level
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.frames.store import PROBES_FILE
-from pipeline.weights import OBJECTS_FILE, TIMM_WEIGHTS, backbone_files
+from pipeline.videos.records import Assignment, Probe
+from pipeline.weights.backbones import TIMM_WEIGHTS, backbone_files
 
 LIBRARIES = ("octopi-pipeline", "torch", "transformers", "peft", "open_clip_torch", "timm", "av")
 LIMITS = (

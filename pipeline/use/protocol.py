@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AliasChoices, BaseModel, BeforeValidator, Field, ValidationError, field_validator
 
-from pipeline.core.errors import UserError, first_problem
 from pipeline.language.chat import TACTILE
+from pipeline.running.errors import UserError, first_problem
 
 DATA_URI = re.compile(r"data:[\w.+/-]*(?:;[\w.+/=-]+)*;base64,", re.ASCII)
 MESSAGES, CHARACTERS = 64, 20_000

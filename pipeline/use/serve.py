@@ -21,7 +21,7 @@ from fastapi.responses import JSONResponse, Response, StreamingResponse
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
-from pipeline.core.errors import UserError
+from pipeline.running.errors import UserError
 from pipeline.use.media import PLACE, Gate
 from pipeline.use.protocol import ChatRequest, Json, Reply, read_conversation, read_request
 from pipeline.use.results import Exchange

@@ -16,7 +16,7 @@ from typing import Any
 import uvicorn
 from fastapi import FastAPI
 
-from pipeline.core.errors import UserError
+from pipeline.running.errors import UserError
 
 logger = logging.getLogger(__name__)
 

@@ -9,16 +9,19 @@ from pathlib import Path
 import torch
 
 from pipeline.config import Params
-from pipeline.core.embeddings import EmbeddingStore
-from pipeline.core.errors import UserError
-from pipeline.core.records import Classification, GradedVision, Part, Shown, Video
-from pipeline.core.runtime import track
+from pipeline.core.records import Part
+from pipeline.encoder.records import Classification
 from pipeline.evaluation.grading import conclude, grade
+from pipeline.evaluation.records import GradedVision, Shown
 from pipeline.language.generate import answer
+from pipeline.running.errors import UserError
+from pipeline.running.progress import track
 from pipeline.tasks.base import Pool
 from pipeline.tasks.questions import build_questions, counts_by_task
+from pipeline.training.embeddings import EmbeddingStore
 from pipeline.use.model import Octopi
 from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.records import Video
 
 logger = logging.getLogger(__name__)
 

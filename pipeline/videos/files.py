@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
-from pipeline.core.errors import UserError, readable
-from pipeline.core.records import Finding, Severity, finding
+from pipeline.running.errors import UserError, readable
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.catalogue.csv_reader import read_rows
 from pipeline.videos.decoding import SUFFIXES
+from pipeline.videos.records import Finding, Severity, finding
 
 LIST_FILE = "videos.csv"
 """Optional, in the videos' folder: columns `file`, `object_id` and, where known, `session`."""

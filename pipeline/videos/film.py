@@ -14,7 +14,7 @@ import av
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.core.errors import UserError
+from pipeline.running.errors import UserError
 
 KEY_EVERY = 12
 """Frames from one keyframe to the next: in each of the public videos looked at, and libavcodec's own default."""

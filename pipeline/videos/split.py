@@ -9,11 +9,12 @@ from operator import eq
 from pathlib import Path
 
 from pipeline.config import SplitConfig
-from pipeline.core.errors import UserError
 from pipeline.core.io import read_table
-from pipeline.core.records import Assignment, Part, Video
+from pipeline.core.records import Part
 from pipeline.core.runtime import derive_seed
+from pipeline.running.errors import UserError
 from pipeline.videos.catalogue import RULED_SPLITS, Catalogue
+from pipeline.videos.records import Assignment, Video
 
 CANDIDATES = 2000
 """Number of random sets of test objects; the development split takes the most balanced one."""

@@ -10,10 +10,11 @@ from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.core.errors import UserError
 from pipeline.core.io import tensor_shapes
-from pipeline.core.runtime import quiet_libraries
-from pipeline.weights import BACKBONES, CLIP_CONFIG, again, first_words, load_language
+from pipeline.running.errors import UserError
+from pipeline.running.progress import quiet_libraries
+from pipeline.weights import again, first_words, load_language
+from pipeline.weights.backbones import BACKBONES, CLIP_CONFIG
 
 if TYPE_CHECKING:
     from open_clip.transformer import VisionTransformer

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import yaml
 
-from pipeline.core.errors import UserError
 from pipeline.core.io import atomic_folder, write_text
+from pipeline.running.errors import UserError
 from pipeline.weights import DOWNLOADED, MADE, installed, tiny
 from pipeline.weights.check import VICUNA_7B
 

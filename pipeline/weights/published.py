@@ -11,9 +11,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.core.errors import UserError
 from pipeline.core.io import atomic_folder, load_tensors, sha256, write_text
-from pipeline.weights import CLIP_CONFIG, DOWNLOADED, check_language, frame_side, load_language, sparsh
+from pipeline.running.errors import UserError
+from pipeline.weights import DOWNLOADED, check_language, load_language, sparsh
+from pipeline.weights.backbones import CLIP_CONFIG, frame_side
 from pipeline.weights.check import (
     LLM_CONFIG,
     PUBLISHED_CLIP,

@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.core.errors import UserError
 from pipeline.core.records import GAIN, MIDDLE
+from pipeline.running.errors import UserError
 from pipeline.weights import first_words
 
 if TYPE_CHECKING:

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.core.errors import UserError
 from pipeline.core.io import save_tensors, write_json
 from pipeline.core.runtime import derive_seed
-from pipeline.weights import CLIP_CONFIG, CLIP_WEIGHTS
+from pipeline.running.errors import UserError
+from pipeline.weights.backbones import CLIP_CONFIG, CLIP_WEIGHTS
 
 if TYPE_CHECKING:
     from transformers import PreTrainedTokenizerFast

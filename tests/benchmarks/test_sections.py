@@ -14,9 +14,10 @@ import yaml
 from benchmarks import contact, encoder, frames, serving, systems, training
 from benchmarks.table import Row, merge, read_rows
 from pipeline.core.io import write_csv, write_json
-from pipeline.core.records import Encoder, Lora, Opd, ScoreRow, Variant
+from pipeline.core.records import Encoder, Lora, Opd, Variant
 from pipeline.encoder import frame_classifier
 from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.evaluation.rows import ScoreRow
 from pipeline.scales import compose, write_params
 from pipeline.scenes.light import make_sensor, shade
 from pipeline.training.trainable import save_trainable

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from benchmarks import __main__ as command
 from benchmarks.figures import FOLDER, draw
 from benchmarks.table import CSV, Error, Row, front, make_rows, mean_of, merge, read_rows, share_of
-from pipeline.core.records import ScoreRow
+from pipeline.evaluation.rows import ScoreRow
 from tests.conftest import refused
 
 POINTS = st.lists(st.tuples(st.integers(1, 6), st.integers(0, 6)), min_size=1, max_size=12)

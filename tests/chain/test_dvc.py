@@ -22,7 +22,7 @@ from tests.project import OBJECTS, REDUCED, copy_project
 
 TOLD = {
     *("pipeline/__init__.py", "pipeline/config/__init__.py", "pipeline/config/params.py", "pipeline/tracking"),
-    *("pipeline/core/errors.py", "pipeline/core/parallel.py", "pipeline/core/stage.py"),
+    "pipeline/running",
 }
 """How a stage is told what to do and says what it did. They change no result. Of `config.py`, which every stage reads,
 that holds for all but what it computes: a parameter is a dependency by its value, and params.yaml has them all."""
@@ -137,6 +137,31 @@ def test_a_split_without_a_test_object_is_one_warning(tmp_path: Path, caplog: py
     assert [line for line in caplog.messages if "is empty" in line] == []
     assert len(said) == 1
     assert "7 of 7 test objects have no videos (bath_towel, " in said[0]
+
+
+RUNS_ALL = {"package", "publish", "report"}
+EDITS = {
+    "pipeline/evaluation/rows.py": RUNS_ALL,
+    "pipeline/report/tables.py": {"report", "publish"},
+    "pipeline/running/progress.py": set(),
+    "pipeline/weights/backbones.py": {
+        *("weights", "pretrain", "finetune_encoder", "embed", "shipped"),
+        "report",
+        "package",
+    },
+    "pipeline/evaluation/grading.py": {"grade", "shipped", *RUNS_ALL},
+    "pipeline/tasks/pc.py": {"questions", "grade", "shipped", *RUNS_ALL},
+    "pipeline/language/chat.py": {"align", "lora", "answer", "shipped", "report", "package"},
+}
+"""A row of a report, a column of its tables, a line of progress, a backbone, a grader, a prompt and its grader, a chat
+format: and the stages that an edit makes stale. What follows these runs where their outputs come out otherwise."""
+
+
+@pytest.mark.parametrize("file", EDITS)
+def test_an_edit_makes_stale_what_it_can_change(file: str) -> None:
+    assert (ROOT / file).is_file()
+    stale = {n for n in stages() if any(file == d or file.startswith(f"{d}/") for d in code(n))}
+    assert stale == EDITS[file]
 
 
 def test_what_computes_with_floats_depends_on_the_kernels() -> None:

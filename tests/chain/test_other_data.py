@@ -15,13 +15,14 @@ from safetensors.numpy import load_file
 
 from pipeline.config import SplitConfig
 from pipeline.core.io import read_jsonl, read_table
-from pipeline.core.records import Assignment, Opd, Part, Question
+from pipeline.core.records import Opd, Part, Question
 from pipeline.report.build import write_report
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.catalogue.wording import levels_named
 from pipeline.videos.files import list_videos
+from pipeline.videos.records import Assignment
 from pipeline.videos.split import assign_objects
 from tests.closure import ROOT
 from tests.fake_run import fake_params, write_run

@@ -13,7 +13,6 @@ import pytest
 import torch
 
 from pipeline.config import PRETRAINED
-from pipeline.core.embeddings import FLIPS
 from pipeline.core.records import Part
 from pipeline.core.runtime import seed_everything
 from pipeline.encoder import tuned
@@ -26,9 +25,10 @@ from pipeline.encoder.scene_encoder import SIDE
 from pipeline.encoder.timm_backbone import TimmBackbone
 from pipeline.encoder.tuned import TrunkDataset, run_trunks
 from pipeline.report.provenance import encoder_words
+from pipeline.training.embeddings import FLIPS
 from pipeline.training.trainable import save_trainable, trainable_state
 from pipeline.videos.frames.store import FrameStore
-from pipeline.weights import BACKBONES, Backbone, backbone_files, check_encoder
+from pipeline.weights.backbones import BACKBONES, Backbone, backbone_files, check_encoder
 from pipeline.weights.check import check_encoder_files
 from tests.closure import ROOT
 from tests.conftest import refused

@@ -16,14 +16,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import expit
 
-import pipeline.core.parallel
+import pipeline.running.parallel
 from pipeline.config import FramesConfig, PretrainConfig
-from pipeline.core.errors import UserError
 from pipeline.core.runtime import seed_everything
 from pipeline.encoder import synthetic as module
 from pipeline.encoder.pretrain import STRENGTH, PretrainingDataset, PretrainingModel, vary
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.encoder.synthetic import HEIGHT, KINDS, PITCH, SIDE, WIDTH, SyntheticPictures, draw_object, draw_pictures
+from pipeline.running.errors import UserError
 from pipeline.scenes.geometry import heights
 from pipeline.scenes.invent import MODULUS_MPA, invent
 from pipeline.scenes.measure import bump_share, texture
@@ -72,7 +72,7 @@ def test_an_object_follows_from_seed_and_number_alone(drawn: SyntheticPictures) 
 
 @pytest.mark.slow
 def test_a_killed_drawing_goes_on(drawn: SyntheticPictures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pipeline.core.parallel, "cores", lambda: 1)
+    monkeypatch.setattr(pipeline.running.parallel, "cores", lambda: 1)
     monkeypatch.setattr(module, "CHUNK", 4)
 
     def dying(number: int, config: PretrainConfig, frames: FramesConfig) -> SyntheticPictures:

@@ -23,8 +23,7 @@ from sklearn.preprocessing import StandardScaler
 from transformers import TrainerCallback
 
 from pipeline.config import PRETRAINED, Recipe
-from pipeline.core.embeddings import Statistics
-from pipeline.core.records import Assignment, Embedding, Flip, Part
+from pipeline.core.records import Embedding, Flip, Part
 from pipeline.core.runtime import derive_seed, seed_everything
 from pipeline.encoder import finetune as module
 from pipeline.encoder.data import ClipDataset, EncoderData, LabelledVideo
@@ -35,10 +34,12 @@ from pipeline.encoder.frame_classifier import STRENGTHS
 from pipeline.encoder.model import Heads, PropertyClassifier
 from pipeline.encoder.recipes import RECIPES, base_encoder, property_classifier
 from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.training.embeddings import Statistics
 from pipeline.training.sampling import sample_evaluation, sample_training
 from pipeline.training.trainable import load_trainable, save_trainable, trainable_state
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
+from pipeline.videos.records import Assignment
 from tests.conftest import refused
 from tests.encoder.conftest import Hook, gradient, setting_of
 from tests.encoders import PARTS, config, float64, training, write_frames, write_pretrained

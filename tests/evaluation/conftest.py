@@ -6,8 +6,9 @@ import itertools
 
 from hypothesis import strategies as st
 
-from pipeline.core.records import Encoder, Graded, Lora, Opd, Touch
+from pipeline.core.records import Encoder, Lora, Opd, Touch
 from pipeline.evaluation.intervals import Objects
+from pipeline.evaluation.records import Graded
 from pipeline.videos.catalogue import load_catalogue
 from tests.closure import ROOT
 

@@ -21,13 +21,15 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.core.errors import UserError
 from pipeline.core.io import read_jsonl, read_table, write_jsonl, write_table
-from pipeline.core.records import Assignment, Frame, GradedVision, Opd, Part, Prediction, Question, Shown, Turn
+from pipeline.core.records import Opd, Part, Prediction, Question, Turn
 from pipeline.evaluation.answer_with import instruction
+from pipeline.evaluation.records import GradedVision, Shown
 from pipeline.report.load import Report, load_report
+from pipeline.running.errors import UserError
 from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.records import Assignment, Frame
 from tests.closure import ROOT, closure
 from tests.conftest import deaf_port
 from tests.fake_run import fake_params, write_run

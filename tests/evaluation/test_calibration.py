@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 from scipy.special import softmax
 
-from pipeline.core.records import Classification, Part
+from pipeline.core.records import Part
+from pipeline.encoder.records import Classification
 from pipeline.evaluation.calibration import calibration_error, calibration_rows, fit_temperature, rescale
 from tests.conftest import classified
 

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from pipeline.cli import app
 from pipeline.cli.diff import compare
 from pipeline.core.io import write_table
-from pipeline.core.records import Graded
+from pipeline.evaluation.records import Graded
 from tests.conftest import refused
 from tests.evaluation.conftest import graded
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.core.records import Assignment, Part
+from pipeline.core.records import Part
 from pipeline.evaluation.maps import map_frame
+from pipeline.videos.records import Assignment
 from tests.evaluation.conftest import CATALOGUE
 
 

@@ -9,9 +9,11 @@ import pytest
 from sklearn.metrics import recall_score
 
 from pipeline.core.io import read_csv, write_csv
-from pipeline.core.records import Classification, EffectRow, Part, ScoreRow
+from pipeline.core.records import Part
+from pipeline.encoder.records import Classification
 from pipeline.evaluation.intervals import accuracy_interval
 from pipeline.evaluation.paired import paired
+from pipeline.evaluation.rows import EffectRow, ScoreRow
 from pipeline.evaluation.scores import effect_rows, score_rows, with_holm
 from pipeline.tasks import TASKS
 from tests.conftest import classified

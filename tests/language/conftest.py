@@ -10,17 +10,18 @@ import torch
 from torch.nn import functional as F
 
 from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig, TrainConfig
-from pipeline.core.embeddings import FLIPS, EmbeddingStore
 from pipeline.core.io import save_tensors, write_table
-from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Assignment, Embedding, Opd, Part, Question
+from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Embedding, Opd, Part, Question
 from pipeline.core.runtime import seed_everything
 from pipeline.language.lora import add_lora
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import Job, Material, assemble, fit
 from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.training import trainer
+from pipeline.training.embeddings import FLIPS, EmbeddingStore
 from pipeline.training.trainer import Trained
 from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.records import Assignment
 from tests.checkpoints import write_llama
 from tests.conftest import ROOT
 

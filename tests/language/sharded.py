@@ -18,10 +18,10 @@ from torch.nn import Module
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 from pipeline.config import LanguageConfig, LoraTrainConfig
-from pipeline.core.embeddings import EmbeddingStore
 from pipeline.core.io import read_jsonl, save_tensors, write_json
 from pipeline.core.records import Question
 from pipeline.language.training import Job, Material
+from pipeline.training.embeddings import EmbeddingStore
 from pipeline.training.trainer import TrainableTrainer, Trained
 from tests.language.conftest import SMALL, material, train
 

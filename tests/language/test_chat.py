@@ -19,10 +19,10 @@ from hypothesis import strategies as st
 from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors, trainers
 from transformers import AutoTokenizer, PreTrainedTokenizerBase, PreTrainedTokenizerFast
 
-from pipeline.core.errors import UserError
 from pipeline.core.records import Turn
 from pipeline.language.base import load_llm, load_tokenizer
 from pipeline.language.chat import IGNORE_INDEX, TACTILE, add_tactile_tokens, encode, end_ids, render
+from pipeline.running.errors import UserError
 from tests.checkpoints import edit, write_llama
 from tests.conftest import refused
 

@@ -6,11 +6,12 @@ import pytest
 import torch
 from scipy.special import softmax
 
-from pipeline.core.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
-from pipeline.core.records import Classification, Part, Question
+from pipeline.core.records import Part, Question
+from pipeline.encoder.records import Classification
 from pipeline.evaluation.grading import conclude
 from pipeline.language.classes import in_words, uncontradicted
 from pipeline.tasks.questions import build_questions
+from pipeline.training.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
 from tests.language.conftest import write_store
 from tests.tasks.shared import CATALOGUE, POOL
 

@@ -15,13 +15,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.utils.data import BatchSampler
 
-from pipeline.core.embeddings import EmbeddingStore
 from pipeline.core.io import read_table, save_tensors
 from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Embedding, Turn
 from pipeline.core.runtime import derive_seed
 from pipeline.language.conversations import FILLER, UpdateSampler
 from pipeline.language.generate import write_prompt
 from pipeline.language.training import Material, assemble
+from pipeline.training.embeddings import EmbeddingStore
 from tests.conftest import refused
 from tests.language.conftest import FRAMES, generation, taking
 

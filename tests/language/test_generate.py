@@ -8,13 +8,13 @@ from pathlib import Path
 import torch
 
 from pipeline.config import LanguageConfig
-from pipeline.core.embeddings import EmbeddingStore
 from pipeline.core.records import Opd, Question
 from pipeline.language.chat import encode, render
 from pipeline.language.conversations import evaluation_features
 from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import assemble
+from pipeline.training.embeddings import EmbeddingStore
 from tests.checkpoints import write_llama
 from tests.conftest import refused
 from tests.language.conftest import DIM, FRAMES, generation, material, taking

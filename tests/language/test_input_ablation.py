@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from pipeline.core.embeddings import EmbeddingStore
 from pipeline.core.records import Dialogue, Gold, Opd, Part, Question, Touch, Turn
 from pipeline.language.conversations import evaluation_features
 from pipeline.language.input_ablation import ablate_input
+from pipeline.training.embeddings import EmbeddingStore
 from tests.conftest import refused
 from tests.language.conftest import DIM, write_store
 

@@ -13,7 +13,6 @@ from safetensors.torch import load_file, save_file
 from transformers import AutoModelForCausalLM
 
 from pipeline.config import LanguageConfig
-from pipeline.core.embeddings import EmbeddingStore
 from pipeline.core.records import Question
 from pipeline.language.base import load_llm, load_tokenizer
 from pipeline.language.chat import IGNORE_INDEX
@@ -21,6 +20,7 @@ from pipeline.language.conversations import collate
 from pipeline.language.lora import add_lora
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import assemble
+from pipeline.training.embeddings import EmbeddingStore
 from tests.checkpoints import contents, cut, edit, replace, write_llama
 from tests.conftest import refused
 from tests.language.conftest import DIM, LORA, adapted, assert_comes_back, call, material, taking

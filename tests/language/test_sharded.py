@@ -22,10 +22,10 @@ import torch
 import yaml
 from safetensors.torch import load_file
 
-from pipeline.core.errors import UserError
 from pipeline.core.io import write_jsonl
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import Material
+from pipeline.running.errors import UserError
 from tests.closure import ROOT
 from tests.conftest import HUNG
 from tests.language.sharded import CONFIG, KINDS, run

@@ -19,13 +19,13 @@ from torch.optim.optimizer import Optimizer, register_optimizer_step_pre_hook
 from transformers import TrainerCallback, TrainerState
 
 from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig
-from pipeline.core.embeddings import STATISTICS_FILE, EmbeddingStore
 from pipeline.core.io import read_jsonl, write_jsonl
 from pipeline.core.records import Encoder, Opd, Question
 from pipeline.language.chat import IGNORE_INDEX
 from pipeline.language.lora import add_lora
 from pipeline.language.training import Job, Material, assemble, fit, write_model_card
 from pipeline.scales import compose
+from pipeline.training.embeddings import STATISTICS_FILE, EmbeddingStore
 from pipeline.training.trainer import Trained, training_arguments
 from tests.checkpoints import contents, write_llama
 from tests.closure import ROOT

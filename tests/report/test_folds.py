@@ -10,9 +10,11 @@ import pandas as pd
 import pytest
 
 from pipeline.core.io import read_table
-from pipeline.core.records import Assignment, Graded, Part
+from pipeline.core.records import Part
+from pipeline.evaluation.records import Graded
 from pipeline.report.build import write_report
 from pipeline.report.load import load_report
+from pipeline.videos.records import Assignment
 from tests.fake_run import fake_params, write_run
 
 

@@ -14,9 +14,9 @@ import pytest
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.core.errors import UserError
 from pipeline.report import page as module
 from pipeline.report.page import LARGEST, PAGE, left_to_users, write_page
+from pipeline.running.errors import UserError
 from tests.checkpoints import edit
 from tests.closure import ROOT
 from tests.report.conftest import report, score

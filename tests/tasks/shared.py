@@ -5,9 +5,10 @@ from __future__ import annotations
 import random
 from itertools import islice
 
-from pipeline.core.records import Part, Prediction, Question, Score
+from pipeline.core.records import Part, Prediction, Question
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool
+from pipeline.tasks.records import Score
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from tests.closure import ROOT
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.core.records import Assignment, Part, Question
+from pipeline.core.records import Part, Question
 from pipeline.report.samples import choose_examples
 from pipeline.tasks import TASKS
 from pipeline.tasks.examples import build_examples, grade_example
+from pipeline.videos.records import Assignment
 from tests.tasks.shared import CATALOGUE, predicted
 
 

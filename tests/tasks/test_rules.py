@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.core.records import Classification
+from pipeline.encoder.records import Classification
 from pipeline.evaluation.grading import conclude
 from pipeline.evaluation.scores import RULES, effect_rows, score_rows
 from pipeline.tasks import TASKS

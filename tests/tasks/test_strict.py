@@ -7,10 +7,11 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.records import Opd, Question, Score
+from pipeline.core.records import Opd, Question
 from pipeline.tasks import TASKS
 from pipeline.tasks.opd import as_published
 from pipeline.tasks.questions import build_questions
+from pipeline.tasks.records import Score
 from pipeline.videos.catalogue import Catalogue
 from tests.tasks import shared
 from tests.tasks.shared import CATALOGUE, POOL

@@ -9,11 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.core.records import Opd, Part, Question, Score
+from pipeline.core.records import Opd, Part, Question
 from pipeline.language.chat import TACTILE
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool, find_level
 from pipeline.tasks.questions import build_questions
+from pipeline.tasks.records import Score
 from pipeline.videos.catalogue import Catalogue
 from tests.tasks.shared import CATALOGUE, drafted, grade
 

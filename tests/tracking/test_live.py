@@ -32,7 +32,7 @@ from transformers.integrations import MLflowCallback
 from pipeline.config import Params
 from pipeline.core.io import write_table
 from pipeline.core.records import Measurement
-from pipeline.core.stage import Stage
+from pipeline.running.stage import Stage
 from pipeline.scales import write_params
 from pipeline.tracking import live as live_module
 from pipeline.tracking.chain import settings
@@ -189,7 +189,7 @@ def test_without_live_logging_and_beside_the_first_process_mlflow_is_not_importe
     shutil.rmtree("mlruns")
     write_params(watched(chain.params, live=on))
     code = (
-        "import sys; from pipeline.config.params import load_params; from pipeline.core.stage import Stage\n"
+        "import sys; from pipeline.config.params import load_params; from pipeline.running.stage import Stage\n"
         f"from pipeline.tracking.live import live\nwith live(Stage('{ALIGN}', load_params())) as callbacks: pass\n"
         "assert callbacks == [] and 'mlflow' not in sys.modules"
     )

@@ -16,7 +16,7 @@ import yaml
 from typer.testing import CliRunner
 
 from pipeline.core.io import write_table
-from pipeline.core.records import Graded
+from pipeline.evaluation.records import Graded
 from pipeline.scales import write_params
 from pipeline.tracking.chain import accuracies, read_stages
 from pipeline.tracking.publish import publish
@@ -179,7 +179,7 @@ def test_entries_of_other_parameters_are_no_part(chain: FakeChain) -> None:
 
 LORA = """\
 from pathlib import Path
-from pipeline.core.stage import stage
+from pipeline.running.stage import stage
 with stage("lora", "base-0") as run:
     Path("data/base-0/adapter").mkdir(parents=True)
     for file in ("data/base-0/adapter/é", "data/base-0/b", "smoke.json"):
@@ -233,7 +233,7 @@ def test_the_command_says_what_was_added_or_in_one_line_why_it_could_not(chain: 
 
 
 PUBLISH = """\
-from pipeline.core.stage import stage
+from pipeline.running.stage import stage
 from pipeline.tracking.publish import publish
 with stage("publish") as run:
     print(publish(run.params))

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config import FramesConfig
-from pipeline.core.errors import UserError
+from pipeline.running.errors import UserError
 from pipeline.use.frames import read_touch
 from pipeline.use.model import with_marks
 from pipeline.use.results import Description, Touch, Video

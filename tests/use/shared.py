@@ -10,22 +10,17 @@ import numpy as np
 import torch
 
 from pipeline.config import Params
-from pipeline.core.embeddings import STATISTICS_FILE, EmbeddingStore
 from pipeline.core.io import fingerprint, save_tensors, write_json, write_jsonl, write_table
 from pipeline.core.records import (
     INDEX_FILE,
     TENSOR,
     TENSOR_FILE,
-    Assignment,
-    Classification,
     Embedding,
     Encoder,
-    Graded,
     Lora,
     Opd,
     Part,
     Prediction,
-    Probe,
     Question,
     Touch,
     Variant,
@@ -34,11 +29,15 @@ from pipeline.core.runtime import seed_everything
 from pipeline.encoder.data import EncoderData, classify
 from pipeline.encoder.embed import Loaded, embed_videos, standardize, statistics
 from pipeline.encoder.recipes import base_encoder, property_classifier
+from pipeline.encoder.records import Classification
 from pipeline.evaluation.grading import grade
+from pipeline.evaluation.records import Graded
 from pipeline.language.generate import answer
 from pipeline.language.lora import add_lora
 from pipeline.language.octopi import OctopiForCausalLM
+from pipeline.language.start import OBJECTS_FILE, objects_met
 from pipeline.tasks.questions import build_questions, pool_of
+from pipeline.training.embeddings import STATISTICS_FILE, EmbeddingStore
 from pipeline.training.trainable import save_trainable
 from pipeline.use.folder import Base
 from pipeline.use.model import Octopi
@@ -47,7 +46,7 @@ from pipeline.use.results import Exchange
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.extract import extract_frames
 from pipeline.videos.frames.store import PROBES_FILE, FrameStore
-from pipeline.weights import OBJECTS_FILE, objects_met
+from pipeline.videos.records import Assignment, Probe
 from tests.checkpoints import write_llama
 from tests.conftest import moving_square, write_video
 from tests.encoders import write_pretrained, write_timm, write_tower

@@ -13,8 +13,9 @@ import pandas as pd
 import pytest
 
 from pipeline.core.io import read_jsonl, read_table
-from pipeline.core.records import Assignment, Part, Question
+from pipeline.core.records import Part, Question
 from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.records import Assignment
 from tests.closure import ROOT
 from tests.project import copy_project
 from tests.use.shared import Made

@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.core.errors import UserError
+from pipeline.running.errors import UserError
 from pipeline.use import live
 from pipeline.videos.film import write_film
 from pipeline.videos.frames.reference import LONGEST

@@ -19,7 +19,8 @@ from typer.testing import CliRunner
 from pipeline.cli import app
 from pipeline.config import LANGUAGE_DIR
 from pipeline.core.io import read_json, read_table, write_table
-from pipeline.core.records import ALL_SEEDS, GradedVision, Shown, Video
+from pipeline.evaluation.records import GradedVision, Shown
+from pipeline.evaluation.rows import ALL_SEEDS
 from pipeline.language.base import ADAPTER_CONFIG, ADAPTER_WEIGHTS
 from pipeline.report.load import load_report, published
 from pipeline.report.tables import measured
@@ -31,6 +32,7 @@ from pipeline.use.folder import SHIPPED, Base, find_base, read_folder
 from pipeline.use.model import Octopi
 from pipeline.use.shipped import answers_about
 from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.records import Video
 from tests.checkpoints import edit
 from tests.closure import ROOT
 from tests.conftest import fake_videos, refused

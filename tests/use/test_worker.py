@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from pipeline.core.errors import UserError
 from pipeline.language.generate import Stream
+from pipeline.running.errors import UserError
 from pipeline.use.model import Octopi
 from pipeline.use.server import Failed, Worker
 from tests.conftest import HUNG

@@ -14,13 +14,14 @@ import pytest
 
 from pipeline.config import SplitConfig
 from pipeline.core.io import read_csv, write_table
-from pipeline.core.records import Assignment, Finding, Part, Probe, Video
+from pipeline.core.records import Part
 from pipeline.scales import compose, write_params
 from pipeline.videos.audit import leakage
 from pipeline.videos.audit.files import quiet_level, touches
 from pipeline.videos.audit.run import audit_chain, audit_folder, check_folder
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import list_videos
+from pipeline.videos.records import Assignment, Finding, Probe, Video
 from tests.audit_records import ERROR, GOOD_SPLIT, INFO, WARNING, assigned, look_at, odd, of, probe, probes
 from tests.closure import ROOT
 from tests.conftest import encode, moving_square, write_video

@@ -12,9 +12,10 @@ from scipy.ndimage import gaussian_filter
 from sklearn.linear_model import Ridge
 from sklearn.preprocessing import StandardScaler
 
-from pipeline.core.records import Part, Probe, Severity
+from pipeline.core.records import Part
 from pipeline.videos.audit import leakage
 from pipeline.videos.audit.leakage import predictability, sessions
+from pipeline.videos.records import Probe, Severity
 from tests import audit_records as made
 from tests.audit_records import ERROR, GOOD_SPLIT, INFO, OBJECTS, OTHER, WARNING, leaks, look_at, of, probe, probes
 from tests.conftest import encode, write_video

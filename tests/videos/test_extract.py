@@ -18,8 +18,7 @@ import pytest
 
 from pipeline.config import FramesConfig
 from pipeline.core.io import read_table
-from pipeline.core.parallel import run_parallel
-from pipeline.core.records import Finding, Frame, Probe
+from pipeline.running.parallel import run_parallel
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.decoding import fit
 from pipeline.videos.files import VideoFile
@@ -28,6 +27,7 @@ from pipeline.videos.frames.extract import Extraction
 from pipeline.videos.frames.reference import reference_indices
 from pipeline.videos.frames.scan import Scan, scan
 from pipeline.videos.frames.selection import kept_count
+from pipeline.videos.records import Finding, Frame, Probe
 from tests.conftest import encode, moving_square, not_utf8, refused, write_video
 from tests.frame_rules import (
     CONFIG,

@@ -18,9 +18,8 @@ from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.config import FramesConfig
-from pipeline.core.errors import UserError
 from pipeline.core.io import read_csv
-from pipeline.core.records import Severity
+from pipeline.running.errors import UserError
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.decoding import Decoder
 from pipeline.videos.files import list_videos
@@ -28,6 +27,7 @@ from pipeline.videos.film import write_film
 from pipeline.videos.frames.reference import LONGEST
 from pipeline.videos.importing.bags import shots
 from pipeline.videos.importing.presses import SHORTEST, FrameTime, cut, film, presses
+from pipeline.videos.records import Severity
 from tests.frame_rules import decode, scanned
 from tests.use.videos import recording
 

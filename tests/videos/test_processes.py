@@ -34,7 +34,7 @@ def test_a_fork_decodes_after_its_parent_has(tmp_path: Path) -> None:
 @pytest.mark.parametrize("signal_number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
 def test_no_worker_outlives_its_parent(tmp_path: Path, signal_number: int) -> None:
     (tmp_path / "work.py").write_text(
-        "import os, time\nfrom pathlib import Path\nfrom pipeline.core.parallel import run_parallel\n"
+        "import os, time\nfrom pathlib import Path\nfrom pipeline.running.parallel import run_parallel\n"
         "def work(i):\n    Path(f'{os.getpid()}.pid').touch()\n    time.sleep(10**6)\n"
         "if __name__ == '__main__':\n    list(run_parallel(work, range(4), 'x', 'y'))\n"
     )

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.core.records import Severity
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import LIST_FILE, Listing, list_videos, raise_errors
+from pipeline.videos.records import Severity
 from tests.conftest import refused
 
 

@@ -18,7 +18,8 @@ from typer.testing import CliRunner
 from pipeline.cli import app
 from pipeline.encoder.recipes import base_encoder, check_recipe
 from pipeline.language.base import load_llm, load_tokenizer
-from pipeline.weights import MADE_DIR, check_encoder, check_language
+from pipeline.weights import MADE_DIR, check_language
+from pipeline.weights.backbones import check_encoder
 from pipeline.weights.check import check_encoder_files, check_language_files
 from tests.checkpoints import cut, edit, replace, write_clip, write_llama
 from tests.closure import ROOT

@@ -12,7 +12,7 @@ from transformers import AutoTokenizer
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.core.card import front_matter
+from pipeline.training.card import front_matter
 from pipeline.weights import MADE, tiny
 from pipeline.weights.check import PUBLISHED_LANGUAGE
 from pipeline.weights.make import RECIPES, make, write_efficientnet

@@ -6,8 +6,8 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from statistics import fmean, median
 
-from pipeline.core.records import Finding, Probe, Severity, finding
 from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.records import Finding, Probe, Severity, finding
 
 SHORT = 0.5
 """A video with less than this share of the median length at its frame rate is named."""

@@ -7,9 +7,10 @@ from collections.abc import Iterator, Sequence
 from itertools import product
 from statistics import fmean
 
-from pipeline.core.records import Finding, Part, Severity, finding
+from pipeline.core.records import Part
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.catalogue.wording import levels_named
+from pipeline.videos.records import Finding, Severity, finding
 
 TINY = 1e-12
 """Variances up to it are rounding."""

@@ -9,10 +9,11 @@ from statistics import fmean, pstdev
 
 import numpy as np
 
-from pipeline.core.records import Assignment, Finding, Part, Probe, Severity, finding
+from pipeline.core.records import Part
 from pipeline.core.runtime import derive_seed
 from pipeline.videos.audit.files import by_rate, quiet_level, touches
 from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.records import Assignment, Finding, Probe, Severity, finding
 
 DUPLICATE = 0.91
 """Smallest similarity of near-duplicates, however few videos there are. Among 354 real videos, pairs of different

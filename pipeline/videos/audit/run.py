@@ -8,9 +8,8 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from pipeline.config import FramesConfig, SplitConfig
-from pipeline.core.errors import UserError
-from pipeline.core.parallel import run_parallel
-from pipeline.core.records import Assignment, Finding, Probe, Severity, finding
+from pipeline.running.errors import UserError
+from pipeline.running.parallel import run_parallel
 from pipeline.videos.audit.files import check_files
 from pipeline.videos.audit.labels import check_labels
 from pipeline.videos.audit.leakage import check_leakage
@@ -18,6 +17,7 @@ from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import VideoFile, list_videos
 from pipeline.videos.frames.probe import probe
 from pipeline.videos.frames.scan import scan
+from pipeline.videos.records import Assignment, Finding, Probe, Severity, finding
 from pipeline.videos.split import assign
 
 AUDIT_FILE = "audit.csv"

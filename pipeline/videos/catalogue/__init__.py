@@ -17,9 +17,9 @@ from typing import Literal
 import yaml
 from pydantic import Field, ValidationError
 
-from pipeline.core.errors import UserError, first_problem
 from pipeline.core.records import Part, Record
 from pipeline.core.runtime import derive_seed
+from pipeline.running.errors import UserError, first_problem
 from pipeline.videos.catalogue.csv_reader import Row, read_rows
 from pipeline.videos.catalogue.wording import OPENING, Language, Property, Scenario
 

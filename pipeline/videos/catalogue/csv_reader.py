@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from itertools import zip_longest
 from pathlib import Path
 
-from pipeline.core.errors import UserError
+from pipeline.running.errors import UserError
 
 Row = dict[str, str]
 

@@ -15,15 +15,16 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from pipeline.config import FramesConfig
-from pipeline.core.errors import UserError
 from pipeline.core.io import atomic, code_of, fingerprint, write_table
-from pipeline.core.parallel import run_parallel
-from pipeline.core.records import Finding, Frame, Probe, Record, Severity, Video
+from pipeline.core.records import Record
+from pipeline.running.errors import UserError
+from pipeline.running.parallel import run_parallel
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import VideoFile, list_videos, raise_errors
 from pipeline.videos.frames.probe import probe
 from pipeline.videos.frames.scan import scan
 from pipeline.videos.frames.store import FRAMES_FILE, PROBES_FILE, REFERENCES_FILE, TABLE_FILE
+from pipeline.videos.records import Finding, Frame, Probe, Severity, Video
 
 log = logging.getLogger(__name__)
 

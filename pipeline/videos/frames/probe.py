@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 
 from pipeline.core.io import sha256
-from pipeline.core.records import Probe
 from pipeline.videos.decoding import Image
 from pipeline.videos.files import VideoFile
 from pipeline.videos.frames.reference import contact_strength
 from pipeline.videos.frames.scan import Scan
+from pipeline.videos.records import Probe
 
 SIGNATURE_FRAMES = 64
 """Number of frames that a video's signature is computed from; signatures are compared to find copies."""

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import av
 
 from pipeline.config import FramesConfig
-from pipeline.core.records import Finding, Severity, finding
 from pipeline.videos.decoding import Decoder, Header, Image, fit, turns
 from pipeline.videos.files import VideoFile
 from pipeline.videos.frames.reference import (
@@ -22,6 +21,7 @@ from pipeline.videos.frames.reference import (
     unsteady_frames,
 )
 from pipeline.videos.frames.selection import RELEASE_FEWEST, BestFrames, Kept
+from pipeline.videos.records import Finding, Severity, finding
 
 PROBES = 8
 """Frames of a video that contact is measured in, besides the reference's and the last."""

@@ -9,10 +9,10 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.core.errors import UserError
 from pipeline.core.io import fingerprint, read_table
-from pipeline.core.records import Frame
+from pipeline.running.errors import UserError
 from pipeline.videos.frames.subtraction import Pictures, subtract
+from pipeline.videos.records import Frame
 
 FRAMES_FILE = "frames.npy"
 REFERENCES_FILE = "references.npy"

@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from pipeline.core.errors import UserError
+from pipeline.running.errors import UserError
 from pipeline.videos.decoding import Image
 from pipeline.videos.frames.reference import LONGEST
 from pipeline.videos.importing.presses import Shot, read_picture

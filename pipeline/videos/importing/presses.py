@@ -22,9 +22,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from pipeline.core.errors import UserError
 from pipeline.core.io import remove_rests, write_csv
 from pipeline.core.records import Record
+from pipeline.running.errors import UserError
 from pipeline.videos import decoding
 from pipeline.videos.audit.files import FOUND
 from pipeline.videos.catalogue.csv_reader import read_rows

@@ -19,8 +19,9 @@ from typing import Any, TypeVar
 
 from pipeline.config import Backend
 from pipeline.config.params import check_code
-from pipeline.core.errors import UserError
-from pipeline.core.runtime import PORTABLE, DeviceName, cores, progress, track
+from pipeline.core.runtime import PORTABLE, DeviceName, cores
+from pipeline.running.errors import UserError
+from pipeline.running.progress import progress, track
 
 J = TypeVar("J")
 M = TypeVar("M")

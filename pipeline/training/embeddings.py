@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import torch
 
-from pipeline.core.errors import UserError
 from pipeline.core.io import load_tensors, read_table, save_tensors
 from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Embedding, Flip
+from pipeline.running.errors import UserError
 
 FLIPS: tuple[Flip, ...] = ("none", "horizontal", "vertical", "both")
 STATISTICS_FILE = "statistics.safetensors"

@@ -22,11 +22,12 @@ from filelock import FileLock, Timeout
 
 from pipeline.config import Params
 from pipeline.config.params import CHAIN, PARAMS_FILE, load_params
-from pipeline.core.errors import UserError
 from pipeline.core.io import code_of, remove_rests, sha256, write_json
-from pipeline.core.parallel import end_with_parent, use_backend
 from pipeline.core.records import Measurement
-from pipeline.core.runtime import CHECKPOINTS, cores, limit_threads, processor, quiet_libraries, use_kernels
+from pipeline.core.runtime import CHECKPOINTS, cores, limit_threads, processor, use_kernels
+from pipeline.running.errors import UserError
+from pipeline.running.parallel import end_with_parent, use_backend
+from pipeline.running.progress import quiet_libraries
 
 DATA = Path("data")
 RUNS = Path("runs")

@@ -1,0 +1,85 @@
+"""Graded answers, of the chain's own variants and of models that it did not train."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated
+
+from pydantic import AfterValidator
+
+from pipeline.core.records import Encoder, Lora, Opd, Record, Touch, Variant
+from pipeline.tasks.records import Score
+
+Share = Annotated[float, AfterValidator(lambda value: round(value, 6))]
+"""A figure of a report."""
+
+
+class Shown(StrEnum):
+    """What a model that the chain did not train is shown."""
+
+    FRAMES = "frames"
+    """The kept frames of the question's videos."""
+    PHOTOS = "photos"
+    """Photos of the question's objects."""
+    TOUCH = "touch"
+    """The run's tactile videos; only the shipped model is asked this way."""
+    CLASSES = "classes"
+    """The classes that the shipped model's property heads predict; rules answer from them, without a language model."""
+    STANDARDISED = "touch, standardised"
+    """As `TOUCH`, with embeddings standardised over the run's videos (without labels)."""
+
+
+class Graded(Score):
+    """A score, and the variant that it belongs to."""
+
+    encoder: Encoder
+    lora: Lora
+    opd: Opd
+    seed: int
+    """The replicate: with folds, all their answers together count as those of one seed."""
+    trained: int
+    """The seed of `ablation.seeds` under which the model was trained; with folds it says the fold."""
+    touch: Touch
+
+    @property
+    def variant(self) -> Variant:
+        """The answering system."""
+        return Variant(self.encoder, self.lora, self.opd, self.trained)
+
+
+class VisionModel(Record):
+    """A model behind an endpoint that answered about pictures, and how it was asked: a source.json."""
+
+    model: str
+    """As it was asked for."""
+    served_as: tuple[str, ...]
+    """What the endpoint called it."""
+    endpoint: str
+    shown: Shown
+    per_video: int
+    """Most pictures in place of a video."""
+    temperature: float
+    max_tokens: int
+    first: str
+    """Day of the first reply, and of the last; UTC."""
+    last: str
+    ended: dict[str, int]
+    """How many replies ended with `stop`, `length`, `content_filter`, `refusal`, `nothing` (no text), `unsaid`, or
+    another word of the endpoint's."""
+    questions: dict[str, str]
+    """By seed, the fingerprint of the file of questions that it answered."""
+    published: bool = False
+    """Whether it was asked the paper's three prompts alone; else as the full system is, with classes and examples."""
+    folder: str = ""
+    """Where its pictures lay."""
+    frames: str = ""
+    """Fingerprint of the frames that it saw (`frames_key`); empty for photos."""
+
+
+class GradedVision(Score):
+    """A score of a model that the chain did not train."""
+
+    model: str
+    shown: Shown
+    seed: int
+    """As in `Graded`."""
