@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from pipeline.cli import app, main
-from pipeline.core import runtime
+from pipeline.running import progress
 from pipeline.use import ask as asking
 from pipeline.use.ask import Chat, describe_folder
 from pipeline.use.model import Octopi
@@ -41,7 +41,7 @@ def by_command(octopi: Octopi, monkeypatch: pytest.MonkeyPatch) -> Command:
 def test_an_answer_for_machines_however_long_it_takes(
     made: Made, octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(runtime, "QUICK", 0)
+    monkeypatch.setattr(progress, "QUICK", 0)
     monkeypatch.setattr(sys, "argv", ["octopi", "ask", QUESTION, str(files[0]), "--model", str(made.folder), "--json"])
     with pytest.raises(SystemExit):
         main()
@@ -50,7 +50,7 @@ def test_an_answer_for_machines_however_long_it_takes(
     assert found["answer"] == octopi.ask(QUESTION, files[:1])
     assert found["videos"][0]["frames"] == list(octopi.look(files[0]).numbers)
     assert said.err == ""
-    assert list(runtime.track(["a"], "work", "piece")) == ["a"]
+    assert list(progress.track(["a"], "work", "piece")) == ["a"]
     said = capsys.readouterr()
     assert (said.out, said.err) == ("", "work: piece 1 of 1, 0 s left\n")
 
