@@ -28,7 +28,7 @@ QUOTED = r"""'.*'|".*\""""
 def check_code(folder: Path) -> None:
     """Raise UserError where a folder has a `pipeline` of its own, which dvc.lock records, and another one runs."""
     own = folder / PACKAGE.name
-    if (own / "core" / "stage.py").is_file() and not own.samefile(PACKAGE):
+    if (own / "running" / "stage.py").is_file() and not own.samefile(PACKAGE):
         raise UserError(
             f"{PACKAGE} would run, but dvc.lock records {own.resolve()}; activate the environment of that folder "
             "(`make install` there makes it)"

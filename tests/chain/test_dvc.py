@@ -27,7 +27,7 @@ TOLD = {
 """How a stage is told what to do and says what it did. They change no result. Of `config.py`, which every stage reads,
 that holds for all but what it computes: a parameter is a dependency by its value, and params.yaml has them all."""
 
-COMPUTED = {"fold_of", "replicate_of", "variants"}
+COMPUTED = {"fold_of", "replicate_of", "touches", "variants"}
 """What `config.py` computes of parameters, so that it is a dependency of a stage which calls it."""
 
 
