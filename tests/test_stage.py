@@ -120,7 +120,7 @@ def test_no_scale_is_chosen_while_a_stage_runs(here: Path) -> None:
 def clone(tmp_path: Path) -> Path:
     """As much of another clone, in a path with a space, as a check of the folder looks at."""
     folder = tmp_path / "another clone"
-    for file in ("pipeline/core/stage.py", "pipeline/encoder/model.py", "stages/split.py", "dvc.yaml"):
+    for file in ("pipeline/running/stage.py", "pipeline/encoder/model.py", "stages/split.py", "dvc.yaml"):
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
         (folder / file).touch()
     write_params(compose("smoke", conf=ROOT / "conf"), folder / "params.yaml")
