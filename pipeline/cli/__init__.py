@@ -95,23 +95,36 @@ def weights(
     name: Annotated[
         str,
         typer.Argument(
-            help="vicuna-7b, vicuna-13b, clip-vit-large or sparsh of SOURCE; or smollm2, efficientnet-lite0 or one "
-            "with random weights (tiny-clip, tiny-llama, random-clip-vit-large, random-vicuna-7b), which are made here."
+            help="vicuna-7b, vicuna-13b, clip-vit-large or sparsh of SOURCE; smollm2, efficientnet-lite0 or one with "
+            "random weights (tiny-clip, tiny-llama, random-clip-vit-large, random-vicuna-7b), which are made here; or "
+            "octopi-7b, octopi-13b, the weights of Octopi's authors. The README of github.com/clear-nus/octopi links "
+            "them, and states no licence; wanted are encoder.pt, project.pt, tokenizer/, llm_weights/ and, where it is "
+            "there, classifier.pt."
         ),
     ],
     source: Annotated[Path | None, typer.Argument(help="Folder that it was downloaded to.")] = None,
-    to: Annotated[Path | None, typer.Option(help="Folder; below weights/ by default.")] = None,
+    to: Annotated[Path | None, typer.Option(help="Folder; below weights/ or models/ by default.")] = None,
+    base: Annotated[Path | None, typer.Option(help="octopi-7b, octopi-13b: Vicuna's folder.")] = None,
+    clip: Annotated[Path | None, typer.Option(help="octopi-7b, octopi-13b: CLIP ViT-L/14's folder.")] = None,
     trust_pickle: Annotated[
         bool, typer.Option("--trust-pickle", help="Read tensors from pickles; no code of them is run.")
     ] = False,
 ) -> None:
     """Make a base model as a folder of safetensors, or convert or check a downloaded one."""
     from pipeline.running.progress import quiet_libraries
+    from pipeline.use.published import CHECKPOINTS, convert
     from pipeline.weights import DOWNLOADED, MADE
     from pipeline.weights.make import make
     from pipeline.weights.published import SUMS, adopt, new_folder
 
     quiet_libraries()
+    if name in CHECKPOINTS:
+        if source is None or base is None or clip is None:
+            raise UserError(f"{name}: name its folder, --base (Vicuna's folder) and --clip (CLIP ViT-L/14's)")
+        folder, unused = convert(name, source, base, clip, to, trust_pickle=trust_pickle)
+        left = f"unused: {', '.join(unused)}" if unused else "every tensor is used"
+        typer.echo(f"{folder}: written, {left}; `octopi ask --model {folder}` asks it")
+        return
     if name not in DOWNLOADED:
         if source is not None and name in MADE:
             raise UserError(f"{name} is not downloaded but made; leave {source} out, and name a folder with --to")

@@ -28,6 +28,7 @@ Recipe = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]*$")]
 """A name in `pipeline.encoder.recipes.RECIPES`; `octopi scale` checks that it is one."""
 Backend = Literal["processes", "ray"]
 TrainedEmbeddings = Literal["all", "new"]
+ChatFormat = Literal["template", "published"]
 Selection = Literal["salient", "release", "contact"]
 
 INVENTED = Path("data/invented")
@@ -285,6 +286,9 @@ class LanguageConfig(Section):
     """`nf4`: hold the frozen linear layers in four bits (needs bitsandbytes and a CUDA device)."""
     system_prompt: str = ""
     """Put before each conversation (Vicuna has one)."""
+    chat: ChatFormat = "template"
+    """How conversations are written: by the tokenizer's own `template` (without one, Vicuna's), or as `published`,
+    piece by piece."""
     bos: bool = True
     """Begin each conversation about touch with the begin token, where the tokenizer writes one (the published code
     takes it away). A chat template's own stays."""

@@ -11,6 +11,7 @@ from torch.nn.utils.rnn import pad_sequence
 from torch.utils.data import Sampler
 from transformers import PreTrainedTokenizerBase
 
+from pipeline.config import ChatFormat
 from pipeline.core.records import Opd, Question
 from pipeline.core.runtime import derive_seed
 from pipeline.language.chat import IGNORE_INDEX, TACTILE, conclusions, encode, render
@@ -43,6 +44,7 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         tokenizer: PreTrainedTokenizerBase,
         *,
         system_prompt: str,
+        chat: ChatFormat = "template",
         per_video: int,
         flip_probability: float,
         seed: int,
@@ -59,7 +61,9 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         self.written: list[dict[str, torch.Tensor]] = []
         """The tensors of each question that are the same in every epoch."""
         for question, dialogue in asked:
-            rendered = render(dialogue.turns, tokenizer, system_prompt=system_prompt, frames=per_video, complete=True)
+            rendered = render(
+                dialogue.turns, tokenizer, system_prompt=system_prompt, frames=per_video, complete=True, chat=chat
+            )
             encoded = encode(rendered, tokenizer, bos=bos)
             check_length(question.question_id, len(encoded.input_ids), positions)
             learnt = encoded.labels

@@ -95,7 +95,8 @@ def answer(
             if number < len(dialogue.turns):
                 own = [*(s.text for s in said[question.question_id]), ""]
                 turns = [Turn(user=t.user, assistant=a) for t, a in zip(dialogue.turns, own, strict=False)]
-                prompt = write_prompt(turns, model.tokenizer, language, per_video)
+                single = len(dialogue.turns) == 1
+                prompt = write_prompt(turns, model.tokenizer, language, per_video, single=single)
                 check_length(question.question_id, len(prompt) + 1, model.positions)
                 waiting.append((question, prompt))
         features = [evaluation_features(q, store, per_video) for q, _ in waiting]
@@ -115,10 +116,23 @@ def answer(
 
 
 def write_prompt(
-    turns: Sequence[Turn], tokenizer: PreTrainedTokenizerBase, language: LanguageConfig, per_video: int
+    turns: Sequence[Turn],
+    tokenizer: PreTrainedTokenizerBase,
+    language: LanguageConfig,
+    per_video: int,
+    *,
+    single: bool | None = None,
 ) -> tuple[int, ...]:
-    """Token ids of a conversation up to where its last answer is to be said."""
-    rendered = render(turns, tokenizer, system_prompt=language.system_prompt, frames=per_video, complete=False)
+    """Token ids of a conversation up to where its last answer is to be said; `single` as in `render`."""
+    rendered = render(
+        turns,
+        tokenizer,
+        system_prompt=language.system_prompt,
+        frames=per_video,
+        complete=False,
+        chat=language.chat,
+        single=single,
+    )
     return encode(rendered, tokenizer, bos=language.bos).input_ids
 
 

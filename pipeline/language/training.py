@@ -130,6 +130,7 @@ def assemble(
         material.store,
         model.tokenizer,
         system_prompt=language.system_prompt,
+        chat=language.chat,
         per_video=material.per_video,
         flip_probability=material.flip_probability,
         seed=material.seed,

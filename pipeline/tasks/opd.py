@@ -38,10 +38,7 @@ class ObjectPropertyDescription(TaskDefinition):
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         """One score a property, read from the closing sentence ("Overall ..."), and `combined` for all at once."""
-        # Before that sentence an answer describes freely, in words that may name a class in passing.
-        closing = "".join(re.split(rf"\b{OPENING}\b", unmarked(prediction.outputs[0]), flags=re.IGNORECASE)[1:][-1:])
-        expected = question.gold.labels[0]
-        predicted = [find_level(closing, p) for p in catalogue.properties]
+        expected, predicted = question.gold.labels[0], read(prediction.outputs[0], catalogue)
         strict = as_published(prediction.outputs[0], expected, catalogue)
         scores = [
             scored(question, prediction, p.name, p.levels[e], None if g is None else p.levels[g], strict[p.name])
@@ -57,6 +54,19 @@ class ObjectPropertyDescription(TaskDefinition):
     def chance(self, catalogue: Catalogue) -> dict[str, float]:
         single = {p.name: 1 / len(p.levels) for p in catalogue.properties}
         return {**single, "combined": math.prod(single.values())}
+
+
+def read(said: str, catalogue: Catalogue) -> list[int | None]:
+    """The class of each property that the closing sentence ("Overall ...") names; None where it names none."""
+    # Before that sentence an answer describes freely, in words that may name a class in passing.
+    closing = "".join(re.split(rf"\b{OPENING}\b", unmarked(said), flags=re.IGNORECASE)[1:][-1:])
+    return [find_level(closing, p) for p in catalogue.properties]
+
+
+def named(said: str, catalogue: Catalogue) -> dict[str, str]:
+    """By property, the class that `read` finds, where it finds one."""
+    found = zip(catalogue.properties, read(said, catalogue), strict=True)
+    return {p.name: p.levels[level] for p, level in found if level is not None}
 
 
 def as_published(said: str, labels: tuple[int, ...], catalogue: Catalogue) -> dict[str, bool | None]:

@@ -48,9 +48,9 @@ class EncodedVideo(NamedTuple):
 class Classified(NamedTuple):
     """Predictions of the property heads, in the catalogue's order of properties."""
 
-    probabilities: tuple[tuple[float, ...], ...]
+    probabilities: tuple[tuple[float, ...], ...] = ()
     """Calibrated, of each class."""
-    levels: tuple[int, ...]
+    levels: tuple[int, ...] = ()
     """The predicted classes."""
 
 
@@ -76,7 +76,8 @@ class VideoEncoder:
             if not raw.isfinite().all():
                 raise UserError(f"{name}: its embedding is not finite; check the video")
             standard = standardize(raw, self.statistics)
-            if (far := distance(standard.double().numpy())) > (usual := config.usual):
+            far, usual = distance(standard.double().numpy()), config.usual
+            if usual is not None and far > usual:
                 unlike = f"{far:.1f} deviations from its mean, where its own videos reach {usual:.1f}"
                 touch = touch.model_copy(update={"notes": (*touch.notes, f"unlike training: {unlike}")})
             features = standard if config.encoder.standardize else raw
@@ -115,6 +116,8 @@ class VideoEncoder:
     @cached_property
     def _classifier(self) -> PropertyClassifier:
         classifier = property_classifier(self._own, [len(p.levels) for p in self.catalogue.properties])
+        if not self.config.heads:
+            classifier.heads.requires_grad_(False)  # So that the file need not have them.
         load_trainable(classifier, self.place / TRAINED)
         return classifier.to(self.device).eval()
 

@@ -33,6 +33,8 @@ logger = logging.getLogger(__name__)
 SHIPPED = Path(__file__).parents[1] / "pretrained" / "octopi-small"
 """The model that is part of the package."""
 FORMAT = 2
+LIBRARIES = ("octopi-pipeline", "torch", "transformers", "peft", "open_clip_torch", "timm", "av")
+"""Whose versions config.json names."""
 CONFIG, CATALOGUE = "config.json", "catalogue.json"
 ENCODER_DIR, BASE_DIR, BACKBONE_DIR = "encoder", "base", "backbone"
 TRAINED, SCENES = "encoder.safetensors", "scenes.safetensors"
@@ -66,6 +68,8 @@ class ModelConfig(Record):
     variant: str
     encoder_used: Encoder
     """Whose embeddings the language model reads; the heads are always those of the fine-tuned encoder."""
+    heads: bool = True
+    """Whether it has property heads; without them, classes are read off the model's own sentence."""
     opd: Opd
     """How much it was trained to describe before it concludes."""
     trained_on: str
@@ -83,9 +87,9 @@ class ModelConfig(Record):
     refused."""
     quiet: Rounded
     """Contact strength that noise alone gives in its data."""
-    usual: Rounded
+    usual: Rounded | None
     """Largest distance of a training or validation video from the training mean, in standard deviations
-    (`distance`)."""
+    (`distance`); None where it is not known."""
     temperatures: dict[str, Rounded]
     """By property, fitted on validation objects."""
     objects: tuple[str, ...] = ()
@@ -100,8 +104,9 @@ class ModelConfig(Record):
     @property
     def digest(self) -> str:
         """A hash of all that answers depend on, by which two trainings of one variant are told apart."""
-        # Older folders list no objects, and keep their hash.
-        told = self.model_copy(update={"scores": {}, "versions": {}}).model_dump(mode="json", exclude={"objects"})
+        # Folders that were made before a setting was there keep their hash.
+        later = {"objects": True, "heads": self.heads, "language": {"chat"} if self.language.chat == "template" else {}}
+        told = self.model_copy(update={"scores": {}, "versions": {}}).model_dump(mode="json", exclude=later)
         return fingerprint(json.dumps(told, sort_keys=True))
 
 
@@ -165,7 +170,8 @@ def find_base(folder: Path, base: Base, given: Path | None = None) -> Path:
 def chat_sample(tokenizer: PreTrainedTokenizerBase, language: LanguageConfig) -> str:
     """Two turns as a language model's chat format writes them."""
     turns = [Turn(user="a {tactile}", assistant="b"), Turn(user="c", assistant="d")]
-    return render(turns, tokenizer, system_prompt=language.system_prompt, frames=1, complete=True).text
+    system, chat = language.system_prompt, language.chat
+    return render(turns, tokenizer, system_prompt=system, frames=1, complete=True, chat=chat).text
 
 
 def distance(standardised: npt.NDArray[np.float64]) -> float:

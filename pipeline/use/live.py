@@ -133,9 +133,9 @@ def run(model: Octopi, camera: str, question: str, say: Callable[[str], object],
                 said, notes = model.ask(question, [video]), model.notes([video], question)
             else:
                 found = model.describe(video)
-                levels = (
-                    f"{name} {level} ({found.probabilities[name][level]:.0%})" for name, level in found.levels.items()
-                )
+                known = found.probabilities
+                shares = {name: f" ({known[name][level]:.0%})" for name, level in found.levels.items() if name in known}
+                levels = (f"{name} {level}{shares.get(name, '')}" for name, level in found.levels.items())
                 said, notes = "; ".join([*levels, found.sentence]), found.notes
         except UserError as error:
             said, notes = str(error), ()

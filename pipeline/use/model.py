@@ -24,7 +24,7 @@ from pipeline.running.errors import UserError, counted, did_you_mean, readable
 from pipeline.running.progress import quiet_libraries
 from pipeline.tasks import opd, pc, pom, psr, pss
 from pipeline.tasks.base import LETTERS
-from pipeline.use.encoding import EncodedVideo, VideoEncoder
+from pipeline.use.encoding import Classified, EncodedVideo, VideoEncoder
 from pipeline.use.folder import ENCODER_DIR, SHIPPED, ModelConfig, chat_sample, find_base, read_folder
 from pipeline.use.memory import Remembered, most_similar, recall, remember
 from pipeline.use.results import Choice, Comparison, Description, Exchange, Matching, Ranking, Recognition, Touch, Video
@@ -193,22 +193,31 @@ class Octopi:
     def describe_all(self, videos: Sequence[Video], *, sentence: bool = True) -> list[Description]:
         """As `describe`, of many videos in one batch. A video without contact is described with a note."""
         described, asked = [], []
-        silent = ("this variant was not trained to describe, so there is no sentence",)
+        heads, tells = self.config.heads, self.config.opd is not Opd.NONE
+        doubts: tuple[str, ...] = (
+            () if tells else ("this variant was not trained to describe, so there is no sentence",)
+        )
+        doubts += () if heads else ("it has no property heads; its classes are those that its sentence names",)
         for video in videos:  # All of a video at once, as not all may be remembered.
-            encoded, classified = self.encoder.encode(video), self.encoder.classify(video)
-            each = list(zip(self.catalogue.properties, classified.probabilities, classified.levels, strict=True))
+            encoded, classified = self.encoder.encode(video), self.encoder.classify(video) if heads else Classified()
+            each = list(zip(self.catalogue.properties, classified.probabilities, classified.levels, strict=heads))
             description = Description(
                 levels={p.name: p.levels[level] for p, _, level in each},
                 probabilities={p.name: dict(zip(p.levels, found, strict=True)) for p, found, _ in each},
                 sentence="",
                 frames=encoded.touch.numbers,
-                notes=(*self.doubts, *encoded.touch.notes, *(silent if self.config.opd is Opd.NONE else ())),
+                notes=(*self.doubts, *encoded.touch.notes, *doubts),
             )
             described.append(description)
-            if sentence and self.config.opd is not Opd.NONE:
+            if tells and (sentence or not heads):
                 asked.append(self._prompt(opd.TEMPLATES[0], video, untouched=True))
         said = self._reply(asked, None) or [""] * len(videos)
-        return [d.model_copy(update={"sentence": s}) for d, s in zip(described, said, strict=True)]
+        for place, text in enumerate(said):
+            named = {} if heads else opd.named(text, self.catalogue)
+            described[place] = described[place].model_copy(
+                update={"sentence": text} | ({"levels": named} if named else {})
+            )
+        return described
 
     def compare(self, a: Video, b: Video, property: str) -> Comparison:
         """Whether the first video is more of a property than the second, in the wording of training."""
@@ -298,7 +307,8 @@ class Octopi:
             UserError: for a video in which nothing is touched, or a memory that is broken or another encoder's.
         """
         encoded = self.touched(video)
-        classes = tuple(self.describe(video, sentence=False).levels.values())
+        levels = [level for level, _ in self._classes(video)]
+        classes = tuple(p.levels[level] for p, level in zip(self.catalogue.properties, levels, strict=True))
         embedding = tuple(encoded.embedding.tolist())
         touch = Remembered(name=name, classes=classes, encoder=self._encoder_name, embedding=embedding)
         return remember(Path(memory), touch)
@@ -381,7 +391,14 @@ class Octopi:
         return encoded
 
     def _classes(self, video: Video) -> list[tuple[int, float]]:
-        """The heads' prediction for a video: the class and the expected class of each property."""
+        """The class and the expected class of each property, by the heads; without them by the model's sentence."""
+        if not self.config.heads:
+            named = self.describe(video).levels
+            if lacking := [name for name in self.properties if name not in named]:
+                raise UserError(f"{self.touched(video).name}: the model names no class of {lacking[0]}; ask it instead")
+            return [
+                (level, float(level)) for p in self.catalogue.properties for level in [p.levels.index(named[p.name])]
+            ]
         found = self.encoder.classify(video)
         means = (sum(level * p for level, p in enumerate(each)) for each in found.probabilities)
         return list(zip(found.levels, means, strict=True))

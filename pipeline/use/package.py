@@ -33,6 +33,7 @@ from pipeline.use.folder import (
     CONFIG,
     ENCODER_DIR,
     FORMAT,
+    LIBRARIES,
     SCENES,
     TRAINED,
     Base,
@@ -48,7 +49,6 @@ from pipeline.videos.frames.store import PROBES_FILE
 from pipeline.videos.records import Assignment, Probe
 from pipeline.weights.backbones import TIMM_WEIGHTS, backbone_files
 
-LIBRARIES = ("octopi-pipeline", "torch", "transformers", "peft", "open_clip_torch", "timm", "av")
 LIMITS = (
     "It knows objects and sensors only as its training videos show them; for another sensor it must be trained anew.",
     "It was asked templates of the tasks above; what it answers to other questions was never measured.",

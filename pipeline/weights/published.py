@@ -11,10 +11,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.core.io import atomic_folder, load_tensors, sha256, write_text
+from pipeline.core.io import atomic_folder, load_tensors, save_tensors, sha256, write_json, write_text
 from pipeline.running.errors import UserError
 from pipeline.weights import DOWNLOADED, check_language, load_language, sparsh
-from pipeline.weights.backbones import CLIP_CONFIG, frame_side
+from pipeline.weights.backbones import CLIP_CONFIG, CLIP_WEIGHTS, frame_side
 from pipeline.weights.check import (
     LLM_CONFIG,
     PUBLISHED_CLIP,
@@ -26,6 +26,7 @@ from pipeline.weights.check import (
     read_form,
     stored_shapes,
 )
+from pipeline.weights.clip_layout import PICTURES, open_clip_form, to_open_clip
 
 if TYPE_CHECKING:
     import torch
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 SUMS, PIECES = "SHA256SUMS", "tokenizer.model"
 COPIED = (".safetensors", ".json", ".md", ".model", ".txt", "")
 """Endings of weights, and of what lies beside them: settings, card, licence."""
+CARDS = (".md", ".txt", "")
 COMPUTED = "rotary_emb.inv_freq"
 """A tensor that older files store with each layer of a Llama; it follows from the configuration."""
 
@@ -62,8 +64,13 @@ def adopt(name: str, source: Path, to: Path | None = None, *, trust_pickle: bool
     repository, known = DOWNLOADED[name]
     if not source.is_dir():
         raise UserError(f"{source} is no folder; `hf download {repository} --local-dir {source}` makes it")
-    check = check_clip if known in PUBLISHED_CLIP else check_vicuna
-    converted = check is check_clip or ((source / TOKENIZER).is_file() and any(source.glob("*.safetensors")))
+    if known in PUBLISHED_CLIP:
+        check, convert = check_clip, convert_clip
+        # Of a folder with neither layout's configuration, the check says what is missing.
+        converted = (source / CLIP_CONFIG).is_file() or not (source / PICTURES).is_file()
+    else:
+        check, convert = check_vicuna, convert_vicuna
+        converted = (source / TOKENIZER).is_file() and any(source.glob("*.safetensors"))
     if to is None and converted and name != "sparsh":
         check(source, name)
         write_sums(source)
@@ -75,8 +82,8 @@ def adopt(name: str, source: Path, to: Path | None = None, *, trust_pickle: bool
                 write_sparsh(source, temporary, name)
             else:
                 if not converted:
-                    convert_vicuna(source, temporary, name, trust_pickle)
-                copy(source, temporary, COPIED)
+                    convert(source, temporary, name, trust_pickle)
+                copy(source, temporary, CARDS if convert is convert_clip and not converted else COPIED)
                 check(temporary, name)
         except UserError as error:  # What is wrong is so in the folder that was downloaded.
             raise UserError(str(error).replace(str(temporary), str(source))) from None
@@ -124,6 +131,22 @@ def convert_vicuna(source: Path, target: Path, name: str, trust_pickle: bool) ->
         save_torch_state_dict(kept, target, max_shard_size="10GB", metadata={"format": "pt"})
 
 
+def convert_clip(source: Path, target: Path, name: str, trust_pickle: bool) -> None:
+    """Write a CLIP of transformers' as open_clip has it."""
+    write_json(target / CLIP_CONFIG, open_clip_form(source))
+    save_tensors(target / CLIP_WEIGHTS[0], to_open_clip(read_weights(source, name, trust_pickle)), {"format": "pt"})
+
+
+def read_weights(source: Path, name: str, trust_pickle: bool) -> dict[str, torch.Tensor]:
+    """All tensors of a folder of transformers': of its safetensors, or where it has none of its trusted pickles."""
+    if files := sorted(source.glob("*.safetensors")):
+        stored_shapes(files, name)  # Raises for one that is cut off.
+        return {key: value for file in files for key, value in load_tensors(file).items()}
+    if not (pickles := sorted(source.glob("pytorch_model*.bin"))):
+        raise UserError(f"{name}: {source} has no weights, neither safetensors nor a pickle; download them again")
+    return {key: value for file in pickles for key, value in read_pickle(file, name, trust_pickle).items()}
+
+
 def check_clip(folder: Path, name: str) -> None:
     """Raise UserError where a folder in open_clip's layout is not what was published as `name`.
 
@@ -153,7 +176,7 @@ def write_sparsh(source: Path, target: Path, name: str) -> None:
         raise UserError(
             f"{name}: {source} has {len(files)} files *.safetensors, not the one published; download it again"
         )
-    copy(source, target, (".md", ".txt", ""))
+    copy(source, target, CARDS)
     stored_shapes(files, name)  # Raises for one that is cut off.
     sparsh.write(target, load_tensors(files[0]), name)
 
