@@ -260,7 +260,8 @@ def test_a_recipe_brings_its_settings_and_gives_way_to_yours() -> None:
     for recipe in RECIPES:
         composed = compose("smoke", [f"encoder.recipe={recipe}"], conf=CONF)
         assert composed.encoder.recipe == recipe
-        assert composed.language == smoke.language.model_copy(update={"bos": recipe != "release"})
+        own = {"bos": False, "chat": "published"} if recipe == "release" else {}
+        assert composed.language == smoke.language.model_copy(update=own)
         settings = ("all", 0.0) if recipe == "release" else ("new", 1.0)
         assert (composed.align.train_embeddings, composed.lora.max_grad_norm) == settings
         assert composed.encoder.backbone == ("clip",)
