@@ -1,4 +1,4 @@
-"""Choosing a scale: whether what it needs is there, and writing params.yaml, whole or not at all."""
+"""Choosing a scale: whether what it needs is there, what it costs, and writing params.yaml, whole or not at all."""
 
 from __future__ import annotations
 
