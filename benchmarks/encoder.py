@@ -16,7 +16,8 @@ import torch
 from benchmarks.classifier import heads_error
 from benchmarks.frames import bench_videos
 from benchmarks.table import WRONG, Row, machine, make_rows, timed
-from pipeline.config import PRETRAINED, FramesConfig
+from pipeline.config import FramesConfig
+from pipeline.core.layout import PRETRAINED
 from pipeline.encoder.data import ClipDataset, LabelledVideo
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.running.errors import UserError

@@ -4,10 +4,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipeline.core.io import read_jsonl, write_jsonl
+from pipeline.core.layout import answers_dir, embeddings_dir, questions_file, trained_dir
 from pipeline.core.records import Encoder, Lora, Opd, Question, Touch, Variant
 from pipeline.core.runtime import name_dtype
 from pipeline.running.parallel import device_here
-from pipeline.running.stage import DATA, matrix_key, stage
+from pipeline.running.stage import matrix_key, stage
 from pipeline.videos.catalogue import load_catalogue
 
 if __name__ == "__main__":
@@ -19,25 +20,24 @@ if __name__ == "__main__":
         from pipeline.training.embeddings import EmbeddingStore
 
         params, language = run.params, run.params.language
-        store = EmbeddingStore(DATA / "embeddings" / f"{variant.encoder}-{variant.seed}")
-        folder = DATA / "models" / variant.lora / f"{variant.encoder}-{variant.opd}-{variant.seed}"
+        store = EmbeddingStore(embeddings_dir(variant.encoder, variant.seed))
+        folder = trained_dir(variant)
         dtype = name_dtype(language.dtype, params.runtime.device)
         device = params.runtime.device
         source = ModelSource(folder, language.weights, dtype, language.quantization, device, run.started)
         model = replace(source, device=device_here(device))()
-        asked = DATA / "questions" / str(variant.seed)
-        questions = read_jsonl(asked / "evaluation.jsonl", Question)
+        questions = read_jsonl(questions_file(variant.seed), Question)
         if variant.encoder is Encoder.WORDS:
             questions = in_words(questions, store, load_catalogue(Path(params.data.catalogue)))
         per_video = params.frames.per_video
         for touch in params.ablation.touches(variant):
             given, shown = ablate_input(store, touch, questions, variant.seed)
             predictions = answer(model, given, shown, variant.opd, language, per_video, source)
-            write_jsonl(DATA / "answers" / variant.key / f"{touch}.jsonl", predictions)
+            write_jsonl(answers_dir(variant) / f"{touch}.jsonl", predictions)
             run.metrics[f"{touch}.answers"] = len(predictions)
             run.metrics[f"{touch}.tokens"] = sum(p.tokens for p in predictions)
             run.metrics[f"{touch}.truncated"] = sum(p.truncated for p in predictions)
             if variant.full and touch is Touch.REAL:
-                examples = read_jsonl(asked / "examples.jsonl", Question)
+                examples = read_jsonl(questions_file(variant.seed, "examples"), Question)
                 told = answer(model, store, examples, variant.opd, language, per_video, source)
-                write_jsonl(DATA / "answers" / variant.key / "examples.jsonl", told)
+                write_jsonl(answers_dir(variant) / "examples.jsonl", told)

@@ -3,7 +3,8 @@
 from pathlib import Path
 
 from pipeline.core.io import read_table, write_csv, write_text
-from pipeline.running.stage import DATA, stage
+from pipeline.core.layout import AUDIT, FRAMES
+from pipeline.running.stage import stage
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.records import Finding, Probe
 from pipeline.videos.split import read_splits
@@ -15,13 +16,12 @@ if __name__ == "__main__":
 
         findings = audit_chain(
             Path(run.params.data.dir),
-            read_table(DATA / "frames" / PROBES_FILE, Probe),
-            list(read_splits(DATA, run.params.split, run.params.ablation.seeds).values()),
+            read_table(FRAMES / PROBES_FILE, Probe),
+            list(read_splits(run.params.split, run.params.ablation.seeds).values()),
             load_catalogue(Path(run.params.data.catalogue)),
         )
-        out = DATA / "audit"
-        write_csv(out / AUDIT_FILE, Finding, findings)
-        stop_on_errors(findings, out / AUDIT_FILE)
+        write_csv(AUDIT / AUDIT_FILE, Finding, findings)
+        stop_on_errors(findings, AUDIT / AUDIT_FILE)
         # What later stages depend on: always the same bytes, so that a new warning retrains nothing.
-        write_text(out / "passed", "no errors\n")
+        write_text(AUDIT / "passed", "no errors\n")
         run.metrics.update(summary(findings))

@@ -8,9 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipeline.core.io import fingerprint, read_table, save_tensors, write_table
+from pipeline.core.layout import FRAMES, TRAINED_FILE, embeddings_dir, encoder_dir, split_file
 from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Embedding, Encoder, Part
 from pipeline.running.parallel import device_here
-from pipeline.running.stage import DATA, Stage, stage
+from pipeline.running.stage import Stage, stage
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.records import Assignment
 from pipeline.weights.backbones import check_encoder
@@ -18,28 +19,22 @@ from pipeline.weights.backbones import check_encoder
 
 def embed(run: Stage, videos: Sequence[Assignment], state: Path | None) -> tuple[torch.Tensor, list[Embedding]]:
     params = run.params
-    source = EncoderSource(
-        params.encoder,
-        params.runtime.device,
-        frames=DATA / "frames",
-        catalogue=Path(params.data.catalogue),
-        state=state,
-        run=run.started,
-    )
+    catalogue = Path(params.data.catalogue)
+    source = EncoderSource(params.encoder, params.runtime.device, FRAMES, catalogue, state, run.started)
     return embed_videos(replace(source, device=device_here(source.device))(), videos, source)
 
 
-def write(run: Stage, key: str, split: Sequence[Assignment], raw: torch.Tensor, index: Sequence[Embedding]) -> None:
+def write(run: Stage, out: Path, split: Sequence[Assignment], raw: torch.Tensor, index: Sequence[Embedding]) -> None:
     params, heads = run.params, None
     if params.encoder.embedding == "logits":
         raw, heads = logits_of(raw, index, split, load_catalogue(Path(params.data.catalogue)), params.seed)
     known = statistics(raw, index, {a.video_id for a in split if a.part == Part.TRAIN})
-    tensor, out = standardize(raw, known) if params.encoder.standardize else raw, DATA / "embeddings" / key
+    tensor = standardize(raw, known) if params.encoder.standardize else raw
     known._replace(frames=fingerprint(params.frames), heads=heads).save(out / STATISTICS_FILE)
     save_tensors(out / TENSOR_FILE, {TENSOR: tensor})
     write_table(out / INDEX_FILE, Embedding, index)
-    run.metrics[f"{key}.rows"] = len(index)
-    run.metrics[f"{key}.norm"] = float(tensor.norm(dim=1).mean())
+    run.metrics[f"{out.name}.rows"] = len(index)
+    run.metrics[f"{out.name}.norm"] = float(tensor.norm(dim=1).mean())
 
 
 if __name__ == "__main__":
@@ -51,7 +46,7 @@ if __name__ == "__main__":
 
         params = run.params
         check_encoder(Path(params.encoder.weights), params.frames.pixels, params.encoder.backbone)
-        splits = {seed: read_table(DATA / "splits" / f"{seed}.parquet", Assignment) for seed in params.ablation.seeds}
+        splits = {seed: read_table(split_file(seed), Assignment) for seed in params.ablation.seeds}
         for which in params.ablation.encoders:
             if which is Encoder.WORDS:
                 continue
@@ -59,12 +54,12 @@ if __name__ == "__main__":
                 # It has no seed: its embeddings are computed once and standardised for each.
                 found = embed(run, union(splits.values()), None)
                 for seed, split in splits.items():
-                    write(run, f"{which}-{seed}", split, *found)
+                    write(run, embeddings_dir(which, seed), split, *found)
                 continue
             for seed, split in splits.items():
-                trained = DATA / "encoder" / str(seed) / "encoder.safetensors"
-                write(run, f"{which}-{seed}", split, *embed(run, split, trained))
+                trained = encoder_dir(seed) / TRAINED_FILE
+                write(run, embeddings_dir(which, seed), split, *embed(run, split, trained))
         if Encoder.WORDS in params.ablation.encoders:
             for seed in splits:
-                own = DATA / "embeddings" / f"{Encoder.FINETUNED}-{seed}"
-                shutil.copytree(own, own.with_name(f"{Encoder.WORDS}-{seed}"), dirs_exist_ok=True)
+                own, to = (embeddings_dir(which, seed) for which in (Encoder.FINETUNED, Encoder.WORDS))
+                shutil.copytree(own, to, dirs_exist_ok=True)

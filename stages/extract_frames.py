@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from pipeline.core.io import write_table
-from pipeline.core.runtime import CHECKPOINTS
-from pipeline.running.stage import DATA, stage
+from pipeline.core.layout import CHECKPOINTS, FRAMES, VIDEOS
+from pipeline.running.stage import stage
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.records import Video
 
@@ -13,14 +13,9 @@ if __name__ == "__main__":
         from pipeline.videos.frames.extract import extract_frames
 
         data = run.params.data
-        found = extract_frames(
-            Path(data.dir),
-            load_catalogue(Path(data.catalogue)),
-            run.params.frames,
-            DATA / "frames",
-            CHECKPOINTS / "extract_frames",
-        )
-        write_table(DATA / "videos.parquet", Video, found.videos)
+        catalogue, work = load_catalogue(Path(data.catalogue)), CHECKPOINTS / "extract_frames"
+        found = extract_frames(Path(data.dir), catalogue, run.params.frames, FRAMES, work)
+        write_table(VIDEOS, Video, found.videos)
         run.metrics["videos"] = len(found.videos)
         run.metrics["objects"] = len({v.object_id for v in found.videos})
         run.metrics["frames"] = sum(v.frames for v in found.videos)

@@ -3,10 +3,11 @@
 from pathlib import Path
 
 from pipeline.core.io import read_table, write_table
+from pipeline.core.layout import CLASSIFIED_FILE, FRAMES, HISTORY_FILE, TRAINED_FILE, encoder_dir, split_file
 from pipeline.core.records import Measurement, Part
 from pipeline.core.runtime import resolve_device
 from pipeline.encoder.records import Classification
-from pipeline.running.stage import DATA, matrix_key, stage
+from pipeline.running.stage import matrix_key, stage
 from pipeline.tracking.live import live
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.records import Assignment
@@ -22,24 +23,23 @@ if __name__ == "__main__":
 
         params = run.params
         check_encoder(Path(params.encoder.weights), params.frames.pixels, params.encoder.backbone)
-        split = DATA / "splits" / f"{seed}.parquet"
         data = EncoderData(
-            store=FrameStore(DATA / "frames", params.encoder.reference),
+            store=FrameStore(FRAMES, params.encoder.reference),
             catalogue=load_catalogue(Path(params.data.catalogue)),
-            assignments=read_table(split, Assignment),
+            assignments=read_table(split_file(seed), Assignment),
             per_video=params.frames.per_video,
         )
-        inputs = [DATA / "frames" / name for name in (TABLE_FILE, REFERENCES_FILE)] + [split]
+        inputs = [FRAMES / TABLE_FILE, FRAMES / REFERENCES_FILE, split_file(seed)]
         inputs += backbone_files(params.encoder)
         with live(run) as callbacks:
             training = Training(data, params.encoder, params.runtime, params.seed + seed, inputs, callbacks)
             model, history = finetune(training)
         device = resolve_device(params.runtime.device)
         classified = classify(model, data, [Part.VALIDATION, Part.TEST], params.encoder.batch_size, device)
-        out = DATA / "encoder" / str(seed)
-        save_trainable(model, out / "encoder.safetensors")
-        write_table(out / "history.parquet", Measurement, history)
-        write_table(out / "classifications.parquet", Classification, classified)
+        out = encoder_dir(seed)
+        save_trainable(model, out / TRAINED_FILE)
+        write_table(out / HISTORY_FILE, Measurement, history)
+        write_table(out / CLASSIFIED_FILE, Classification, classified)
         write_encoder_card(out, data, params.encoder, params.seed + seed, params.data.source)
         run.finish_training(history)
         for part in (Part.VALIDATION, Part.TEST):

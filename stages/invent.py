@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from pipeline.config import INVENTED
+from pipeline.core.layout import INVENTED
 from pipeline.running.stage import stage
 
 if __name__ == "__main__":

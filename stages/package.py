@@ -2,9 +2,8 @@
 
 from pathlib import Path
 
-from pipeline.running.stage import DATA, stage
-
-MODELS = Path("models")
+from pipeline.core.layout import MODELS
+from pipeline.running.stage import stage
 
 if __name__ == "__main__":
     with stage("package") as run:
@@ -15,5 +14,5 @@ if __name__ == "__main__":
         base = Base.of(Path(params.language.weights))
         wanted = [v for v in params.ablation.variants() if v.full or params.packaged == "all"]
         for variant in wanted:
-            package(DATA, params, variant, base, MODELS / variant.key)
+            package(params, variant, base, MODELS / variant.key)
         run.metrics["models"] = len(wanted)

@@ -1,9 +1,9 @@
 """Pretrain the backbone `scenes` on pictures of invented objects, where the encoder has it."""
 
-from pipeline.config import PRETRAINED
 from pipeline.core.io import write_table
+from pipeline.core.layout import HISTORY_FILE, PRETRAINED
 from pipeline.core.records import Measurement
-from pipeline.running.stage import DATA, stage
+from pipeline.running.stage import stage
 from pipeline.tracking.live import live
 
 if __name__ == "__main__":
@@ -19,4 +19,4 @@ if __name__ == "__main__":
                 encoder, history = pretrain(params.pretrain, params.frames, params.runtime, callbacks)
             save_trainable(encoder, PRETRAINED)
             run.finish_training(history)
-        write_table(DATA / "pretrained" / "history.parquet", Measurement, history)
+        write_table(PRETRAINED.with_name(HISTORY_FILE), Measurement, history)

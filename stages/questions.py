@@ -3,8 +3,9 @@
 from pathlib import Path
 
 from pipeline.core.io import read_table, write_jsonl
+from pipeline.core.layout import questions_file, split_file
 from pipeline.core.records import Part
-from pipeline.running.stage import DATA, stage
+from pipeline.running.stage import stage
 from pipeline.tasks.examples import build_examples
 from pipeline.tasks.questions import build_questions, counts_by_task, pool_of
 from pipeline.videos.catalogue import load_catalogue
@@ -17,7 +18,7 @@ if __name__ == "__main__":
         catalogue = catalogue.called(config.names)
         training = {name: getattr(config, name) for name in ("inexact", "two_turns", "plainly")}
         for seed in run.params.ablation.seeds:
-            assignments = read_table(DATA / "splits" / f"{seed}.parquet", Assignment)
+            assignments = read_table(split_file(seed), Assignment)
             for name, part, counts, distinct in (
                 ("train", Part.TRAIN, counts_by_task(config, "train"), False),
                 ("evaluation", Part.TEST, counts_by_task(config, "evaluation"), True),
@@ -32,8 +33,8 @@ if __name__ == "__main__":
                     fold=run.params.split.fold_of(seed),
                     **(training if part is Part.TRAIN else {}),
                 )
-                write_jsonl(DATA / "questions" / str(seed) / f"{name}.jsonl", questions)
+                write_jsonl(questions_file(seed, name), questions)
                 for task in counts:
                     run.metrics[f"{seed}.{name}.{task}"] = sum(q.task == task for q in questions)
             examples = build_examples(assignments, catalogue, seed=config.seed)
-            write_jsonl(DATA / "questions" / str(seed) / "examples.jsonl", examples)
+            write_jsonl(questions_file(seed, "examples"), examples)

@@ -1,9 +1,10 @@
 """Ask the model that is shipped about this run's videos, all of which are new to it."""
 
 from pipeline.core.io import read_table, write_table
+from pipeline.core.layout import GRADED_SHIPPED, VIDEOS
 from pipeline.core.runtime import limit_threads
 from pipeline.evaluation.records import GradedVision, Shown
-from pipeline.running.stage import DATA, stage
+from pipeline.running.stage import stage
 from pipeline.videos.records import Video
 
 if __name__ == "__main__":
@@ -18,6 +19,6 @@ if __name__ == "__main__":
             limit_threads(2)
             # Half precision on one processor and not on another would make the report depend on the machine.
             octopi = Octopi.from_pretrained(SHIPPED, device=run.params.runtime.device, dtype="float32")
-            graded = answers_about(octopi, run.params, read_table(DATA / "videos.parquet", Video))
+            graded = answers_about(octopi, run.params, read_table(VIDEOS, Video))
             run.metrics["answers"] = len({(g.shown, g.question_id) for g in graded if g.shown is not Shown.CLASSES})
-        write_table(DATA / "shipped.parquet", GradedVision, graded)
+        write_table(GRADED_SHIPPED, GradedVision, graded)

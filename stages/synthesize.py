@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from pipeline.config import SCENES_DIR
 from pipeline.core.io import write_csv
+from pipeline.core.layout import SCENES_DIR
 from pipeline.running.stage import stage
 from pipeline.videos.catalogue import load_catalogue
 

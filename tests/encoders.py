@@ -10,8 +10,9 @@ import numpy as np
 import torch
 from safetensors.torch import load_file, save_file
 
-from pipeline.config import PRETRAINED, EncoderConfig, Recipe, RuntimeConfig
+from pipeline.config import EncoderConfig, Recipe, RuntimeConfig
 from pipeline.core.io import write_table
+from pipeline.core.layout import PRETRAINED
 from pipeline.core.records import Part
 from pipeline.encoder.data import EncoderData
 from pipeline.encoder.finetune import Training

@@ -229,11 +229,12 @@ def test_prune_keeps_what_params_name_and_removes_the_rest(tmp_path: Path) -> No
     params = compose("smoke", conf=CONF)
     kept = {"models/with/base-all-0", "answers/finetuned-with-all-0"}
     for name in (*kept, "models/without/base-all-1", "answers/old", "encoder/3"):
-        (tmp_path / name).mkdir(parents=True)
-    (tmp_path / "answers" / ".DS_Store").touch()
+        (tmp_path / "data" / name).mkdir(parents=True)
+    stray = tmp_path / "data" / "answers" / ".DS_Store"
+    stray.touch()
     prune(params, tmp_path)
-    assert (tmp_path / "answers" / ".DS_Store").is_file(), "it is no variant's"
-    left = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_dir() and not list(p.iterdir())}
+    assert stray.is_file(), "it is no variant's"
+    left = {str(p.relative_to(tmp_path / "data")) for p in tmp_path.rglob("*") if p.is_dir() and not list(p.iterdir())}
     assert left == kept | {"models/without", "encoder"}
     shutil.rmtree(tmp_path)
     prune(params, tmp_path)

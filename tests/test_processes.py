@@ -1,7 +1,4 @@
-"""What starts processes: Ctrl-C, launchers, kills, and work on many files here and on a local cluster of Ray's.
-
-That no worker outlives a parent that is killed is tests/videos/test_processes.py's.
-"""
+"""What starts processes: Ctrl-C, launchers, kills, and work on many files here and on a local cluster of Ray's."""
 
 from __future__ import annotations
 
@@ -95,6 +92,17 @@ def test_ctrl_c_ends_the_processes_of_a_stage(tmp_path: Path, body: str) -> None
     (tmp_path / "stages").mkdir()
     (tmp_path / "stages/slow.py").write_text(f"import time\n{body}\n")
     assert interrupted(tmp_path, sys.executable, "stages/slow.py") == (130, [STOPPED])
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_no_worker_outlives_its_parent(tmp_path: Path, number: signal.Signals) -> None:
+    parent = launch(tmp_path, sys.executable, "-c", f"import time\n{SLEEPING}", errors=subprocess.DEVNULL)
+    while not (workers := psutil.Process(parent.pid).children(recursive=True)):
+        time.sleep(0.05)
+    parent.send_signal(number)
+    wait_until_ended(workers)
+    parent.kill()
+    parent.wait()
 
 
 @pytest.mark.parametrize("code", ["import torch; limit_threads(1)", "limit_threads(1); import torch"])

@@ -83,7 +83,7 @@ def scale(
     if lacking := check_inputs(params):
         typer.echo(lacking)
     changed = write_params(params)
-    prune(params, Path("data"))
+    prune(params, Path())
     typer.echo(
         f"params.yaml {'written' if changed else 'unchanged'}: {name}, {len(params.ablation.variants())} variants"
     )

@@ -19,6 +19,7 @@ from dvc.repo import Repo
 from dvc.scm import RevError
 from scmrepo.exceptions import SCMError
 
+from pipeline.core.layout import GRADED, QUESTIONS
 from pipeline.evaluation.records import Graded
 from pipeline.evaluation.rows import EffectRow
 from pipeline.evaluation.scores import difference, grouped, with_holm
@@ -26,7 +27,6 @@ from pipeline.running.errors import UserError, without_secrets
 from pipeline.tasks import TASKS
 from pipeline.weights import first_words
 
-GRADED, QUESTIONS = "data/graded.parquet", "data/questions"
 SHOWN = 40
 Rows = list[dict[str, Any]]
 
@@ -60,7 +60,7 @@ class State(NamedTuple):
 
     def answers(self) -> list[Graded] | None:
         """Graded answers; None where they are not at hand."""
-        content = self.read(GRADED)
+        content = self.read(str(GRADED))
         rows = None if content is None else pq.read_table(io.BytesIO(content)).to_pylist()
         return None if rows is None else [Graded.model_validate(row) for row in rows]
 

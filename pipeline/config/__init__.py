@@ -12,6 +12,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from pipeline.core.layout import PRETRAINED, SCENES_DIR
 from pipeline.core.records import Encoder, Lora, Opd, Touch, Variant
 from pipeline.core.runtime import DeviceName, DtypeName, Kernels, Quantization
 from pipeline.running.errors import without_secrets
@@ -31,14 +32,8 @@ TrainedEmbeddings = Literal["all", "new"]
 ChatFormat = Literal["template", "published"]
 Selection = Literal["salient", "release", "contact"]
 
-INVENTED = Path("data/invented")
-"""Where the chain puts the catalogue of invented objects; `data.catalogue` names it to have them."""
-SCENES_DIR = Path("data/scenes/videos")
-"""Where the chain puts the videos that it makes itself."""
 LANGUAGE_DIR = "language"
 """Subfolder of a trained model's folder that holds connector and adapter."""
-PRETRAINED = Path("data/pretrained/encoder.safetensors")
-"""Where the chain puts the network that it pretrains on synthetic pictures, the backbone `scenes`."""
 
 
 class Section(BaseModel):

@@ -1,4 +1,4 @@
-"""What all rooms stand on: records (rows of tables), atomic files, errors, seeds, devices, work on many files.
+"""What results depend on and several rooms share: records, paths and keys, atomic files, seeds and number formats.
 
-`stage()` is what each script in stages/ runs in: it reads params.yaml, reports to MLflow and ends with one line.
+Errors, processes and what a stage does around its call are in pipeline/running, since they change no result.
 """

@@ -1,7 +1,7 @@
-"""The typed records that stages hand to each other.
+"""Records that several rooms share: parts of a split, axes of the ablation, questions, answers, curves, embeddings.
 
-Each table or JSON-lines file holds one kind of record; `pipeline.core.io` writes and reads them and
-checks every row against the model.
+A room's own are in its records.py. Each table or JSON-lines file holds one kind of record; `pipeline.core.io` writes
+and reads them and checks every row against the model.
 """
 
 from __future__ import annotations

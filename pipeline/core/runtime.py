@@ -1,4 +1,4 @@
-"""Seeds, devices, number formats, and how far a long run is."""
+"""Seeds, devices, number formats, and the kernels and threads that libraries compute with."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ from pipeline.running.errors import UserError
 
 if TYPE_CHECKING:
     import torch
-CHECKPOINTS = Path("checkpoints")
-"""Where unfinished work waits to be resumed, outside DVC's reach: DVC deletes the outputs of a killed stage."""
 DeviceName = Literal["auto", "cpu", "cuda", "mps"]
 DtypeName = Literal["auto", "float32", "bfloat16", "float16"]
 Quantization = Literal["none", "nf4"]

@@ -25,12 +25,13 @@ from pydantic import Field
 
 from pipeline.config import Params
 from pipeline.core.io import fingerprint, read_jsonl, write_json, write_jsonl
+from pipeline.core.layout import EXTERNAL, questions_file
 from pipeline.core.records import Opd, Prediction, Question, Record
-from pipeline.evaluation.grading import EXTERNAL, SOURCE_FILE
+from pipeline.evaluation.grading import SOURCE_FILE
 from pipeline.evaluation.records import Shown, VisionModel
 from pipeline.running.errors import UserError
 from pipeline.running.progress import track
-from pipeline.running.stage import DATA, alone
+from pipeline.running.stage import alone
 from pipeline.training.sampling import sample_evaluation
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.frames.store import FrameStore, frames_key
@@ -99,13 +100,13 @@ def ask_all(
         raise UserError("--endpoint: the URL is written beside the answers; put a key into OPENAI_API_KEY instead")
     name = re.sub(r"[^\w.-]+", "-", f"{settings['model']}-{shown}{'-published' if published else ''}")
     place = EXTERNAL / params.report_name / name
-    files = {seed: DATA / "questions" / str(seed) / "evaluation.jsonl" for seed in params.ablation.seeds}
+    files = {seed: questions_file(seed) for seed in params.ablation.seeds}
     catalogue = load_catalogue(Path(params.data.catalogue)).called(params.questions.names)
     if published and [(p.name, len(p.levels)) for p in catalogue.properties] != [(n, 3) for n in PUBLISHED]:
         raise UserError(f"--prompt published: is about {', '.join(PUBLISHED)} alone, of three classes; leave it out")
     with alone(f"answer-with@{name}"):
         every = [(s, q) for s, f in files.items() for q in read_jsonl(f, Question) if q.task == "OPD" or not published]
-        training = {seed: read_jsonl(file.with_name("train.jsonl"), Question) for seed, file in files.items()}
+        training = {seed: read_jsonl(questions_file(seed, "train"), Question) for seed in files}
         most = 1 if published and shown is Shown.PHOTOS else params.frames.per_video
         show = _frames(folder, most) if shown is Shown.FRAMES else _photos(folder, [q for _, q in every], most)
         asker = _Asker(url, settings, place / "cache.jsonl")

@@ -19,8 +19,6 @@ from pipeline.tasks import TASKS
 from pipeline.tasks.records import Score
 from pipeline.videos.catalogue import Catalogue
 
-EXTERNAL = Path("external")
-"""What models behind endpoints answered, by report and model: an input of the chain, where no stage asks a network."""
 SOURCE_FILE = "source.json"
 
 

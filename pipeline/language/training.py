@@ -14,6 +14,7 @@ from transformers import TrainerCallback
 
 from pipeline.config import LANGUAGE_DIR, LanguageConfig, LoraTrainConfig, Params, RuntimeConfig, TrainConfig
 from pipeline.core.io import fingerprint, read_jsonl
+from pipeline.core.layout import embeddings_dir, questions_file
 from pipeline.core.records import Encoder, Opd, Question
 from pipeline.core.runtime import derive_seed, name_dtype, seed_everything
 from pipeline.language.base import ADAPTER_WEIGHTS
@@ -51,11 +52,10 @@ class Material:
     """Folder of the adapter of `language.start`, which alignment leaves as it is."""
 
     @classmethod
-    def load(cls, folder: Path, params: Params, encoder: Encoder, opd: Opd, seed: int) -> Self:
+    def load(cls, params: Params, encoder: Encoder, opd: Opd, seed: int) -> Self:
         """Read the questions and one encoder's embeddings from the chain's data folder."""
         dtype, start = name_dtype(params.language.dtype, params.runtime.device), params.language.start
-        asked = folder / "questions" / str(seed) / "train.jsonl"
-        embedded = folder / "embeddings" / f"{encoder}-{seed}"
+        asked, embedded = questions_file(seed, "train"), embeddings_dir(encoder, seed)
         begun = Path(start) / LANGUAGE_DIR / ADAPTER_DIR
         adapter = begun if start and begun.is_dir() else None
         words = encoder is Encoder.WORDS

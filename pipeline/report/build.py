@@ -13,11 +13,12 @@ import pandas as pd
 
 from pipeline.config import AblationConfig, Params
 from pipeline.config.params import PARAMS_FILE
+from pipeline.core import layout
 from pipeline.core.io import R, read_csv, read_jsonl, read_table, write_csv, write_json, write_text
-from pipeline.core.records import TENSOR_FILE, Encoder, Measurement, Part, Prediction, Question, Touch, Variant
+from pipeline.core.records import TENSOR_FILE, Encoder, Lora, Measurement, Part, Prediction, Question, Touch, Variant
 from pipeline.encoder.records import Classification
 from pipeline.evaluation.calibration import CalibrationRow, calibrated, calibration_rows
-from pipeline.evaluation.grading import EXTERNAL, conclude, vision_models
+from pipeline.evaluation.grading import conclude, vision_models
 from pipeline.evaluation.maps import map_frame, means
 from pipeline.evaluation.records import Graded, GradedVision
 from pipeline.evaluation.rows import HEADS, EffectRow, ScoreRow
@@ -53,16 +54,16 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
         UserError: where videos, split or graded answers are missing, or a file is broken. What a run may lack
             (an encoder, curves, samples) is not in its report.
     """
-    data, folder = root / "data", root / "reports" / params.report_name
+    folder = root / layout.REPORTS / params.report_name
     catalogue = load_catalogue(root / params.data.catalogue)
-    videos = read_table(data / "videos.parquet", Video)
-    splits = list(read_splits(data, params.split, params.ablation.seeds).values())
-    graded = read_table(data / "graded.parquet", Graded)
-    vision = [*_read(data / "graded_vision.parquet", GradedVision), *_read(data / "shipped.parquet", GradedVision)]
+    videos = read_table(root / layout.VIDEOS, Video)
+    splits = list(read_splits(params.split, params.ablation.seeds, root).values())
+    graded = read_table(root / layout.GRADED, Graded)
+    vision = [*_read(root / layout.GRADED_VISION, GradedVision), *_read(root / layout.GRADED_SHIPPED, GradedVision)]
     # By the lists in params.yaml, not by the files: after an ablation is narrowed, files of removed variants remain.
-    files = {seed: data / "encoder" / str(seed) / "classifications.parquet" for seed in sorted(params.ablation.seeds)}
+    files = {seed: root / layout.encoder_dir(seed) / layout.CLASSIFIED_FILE for seed in sorted(params.ablation.seeds)}
     by_encoder = {seed: said for seed, file in files.items() if (said := _read(file, Classification))}
-    asked = {seed: read_jsonl(data / "questions" / str(seed) / "evaluation.jsonl", Question) for seed in by_encoder}
+    asked = {seed: read_jsonl(root / layout.questions_file(seed), Question) for seed in by_encoder}
     # With the folds of a replicate pooled, the heads' classifications and what follows from them by rule.
     pooled: dict[int, list[Classification]] = defaultdict(list)
     concluded: dict[int, list[Score]] = defaultdict(list)
@@ -79,26 +80,26 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     origin = provenance(params, catalogue, videos, splits, [g.objects for g in graded], root)
     # Without those whose answers are to other questions than today's, which were not graded.
     rated = {(g.model, g.shown) for g in vision}
-    sources = vision_models(root / EXTERNAL / params.report_name).values()
+    sources = vision_models(root / layout.EXTERNAL / params.report_name).values()
     origin["vision"] = [s.model_dump(mode="json") for s in sources if (s.model, s.shown) in rated]
     write_csv(folder / "scores.csv", ScoreRow, score_rows(graded, catalogue, pooled, vision, concluded))
     write_csv(folder / "effects.csv", EffectRow, effect_rows(graded, catalogue, concluded))
     write_csv(folder / "calibration.csv", CalibrationRow, calibration_rows(list(by_encoder.values())))
-    audit = data / "audit" / "audit.csv"
+    audit = root / layout.AUDIT / "audit.csv"
     write_csv(folder / "audit.csv", Finding, read_csv(audit, Finding) if audit.is_file() else [])
     frames = {
         "dataset.csv": dataset_frame(catalogue, videos, splits),
         "confusion.csv": confusion_frame(pooled, catalogue),
-        "described.csv": described_frame(by_encoder, params, data, catalogue),
-        "curves.csv": curves_frame(data, params.ablation),
-        "map.csv": maps_frame(params, data, catalogue),
+        "described.csv": described_frame(by_encoder, params, root, catalogue),
+        "curves.csv": curves_frame(root, params.ablation),
+        "map.csv": maps_frame(params, root, catalogue),
     }
     for name, frame in frames.items():
         write_text(folder / name, frame.to_csv(index=False, lineterminator="\n"))
     full = [variant for variant in params.ablation.variants() if variant.full]
-    examples = [pair for v in full for pair in _answered(data, v, "examples", "examples")]
+    examples = [pair for v in full for pair in _answered(root, v, "examples", "examples")]
     chosen = choose_samples(
-        _answered(data, full[0], "evaluation", Touch.REAL),
+        _answered(root, full[0], "evaluation", Touch.REAL),
         [g for g in graded if g.variant == full[0] and g.touch is Touch.REAL],
     )
     write_json(folder / "samples.json", {**chosen, **choose_examples(examples, catalogue)})
@@ -189,21 +190,21 @@ def confusion_frame(by_seed: Mapping[int, Sequence[Classification]], catalogue: 
     return pd.DataFrame(rows, columns=["seed", "video_id", "property", "rated", "predicted"])
 
 
-def maps_frame(params: Params, data: Path, catalogue: Catalogue) -> pd.DataFrame:
+def maps_frame(params: Params, root: Path, catalogue: Catalogue) -> pd.DataFrame:
     """The maps of test videos by each encoder's embeddings, of the first seed alone."""
     seed = min(params.ablation.seeds)
     maps = [pd.DataFrame(columns=["encoder", "method", "video_id", "x", "y", *catalogue.property_names])]
-    split = read_table(data / "splits" / f"{seed}.parquet", Assignment)
+    split = read_table(root / layout.split_file(seed), Assignment)
     tested = sorted((a for a in split if a.part is Part.TEST), key=lambda a: a.video_id)
     for encoder in sorted({*params.ablation.encoders} - {Encoder.WORDS}):
-        folder = data / "embeddings" / f"{encoder}-{seed}"
+        folder = root / layout.embeddings_dir(encoder, seed)
         if len(tested) > 1 and (folder / TENSOR_FILE).is_file():
             maps.append(map_frame(means(folder, tested), tested, catalogue).assign(encoder=str(encoder)))
     return pd.concat(maps, ignore_index=True)
 
 
 def described_frame(
-    by_encoder: Mapping[int, Sequence[Classification]], params: Params, data: Path, catalogue: Catalogue
+    by_encoder: Mapping[int, Sequence[Classification]], params: Params, root: Path, catalogue: Catalogue
 ) -> pd.DataFrame:
     """What `octopi describe` says of test videos, beside their labels: a row a seed and video.
 
@@ -212,7 +213,7 @@ def described_frame(
     levels = {p.name: p.levels for p in catalogue.properties}
     sentences: dict[tuple[int, str], str] = {}
     for variant in (v for v in params.ablation.variants() if v.full):
-        for asked, answer in _answered(data, variant, "evaluation", Touch.REAL):
+        for asked, answer in _answered(root, variant, "evaluation", Touch.REAL):
             if asked.task == "OPD":
                 sentences[variant.seed, asked.videos[0]] = " ".join(answer.outputs[-1].split())
     rows: dict[tuple[int, str], dict[str, object]] = {}
@@ -227,29 +228,26 @@ def described_frame(
     return pd.DataFrame(rows.values())
 
 
-def curves_frame(data: Path, ablation: AblationConfig) -> pd.DataFrame:
+def curves_frame(root: Path, ablation: AblationConfig) -> pd.DataFrame:
     """The histories of this ablation's trainings below data/; a stage is named as DVC names it."""
-    seeds = sorted(map(str, ablation.seeds))
-    trained = sorted({f"{v.encoder}-{v.opd}-{v.seed}" for v in ablation.variants()})
-    places = {
-        "pretrain": data / "pretrained",
-        **{f"finetune_encoder@{seed}": data / "encoder" / seed for seed in seeds},
-        **{f"align@{key}": data / "models" / "without" / key for key in trained},
-        **{f"lora@{key}": data / "models" / "with" / key for key in trained},
-    }
+    places = {"pretrain": layout.PRETRAINED.parent}
+    places |= {f"finetune_encoder@{seed}": layout.encoder_dir(seed) for seed in sorted(ablation.seeds, key=str)}
+    for stage, lora in (("align", Lora.WITHOUT), ("lora", Lora.WITH)):
+        trained = {layout.trained_dir(variant._replace(lora=lora)) for variant in ablation.variants()}
+        places |= {f"{stage}@{folder.name}": folder for folder in sorted(trained)}
     rows = [
         (stage, m.name, m.step, m.value)
         for stage, folder in places.items()
-        for m in sorted(_read(folder / "history.parquet", Measurement), key=lambda m: (m.name, m.step))
+        for m in sorted(_read(root / folder / layout.HISTORY_FILE, Measurement), key=lambda m: (m.name, m.step))
         if m.name in LOGGED
     ]
     return pd.DataFrame(rows, columns=["stage", "name", "step", "value"])
 
 
-def _answered(data: Path, variant: Variant, asked: str, said: str) -> list[tuple[Question, Prediction]]:
+def _answered(root: Path, variant: Variant, asked: str, said: str) -> list[tuple[Question, Prediction]]:
     """A variant's questions with its answers, by the names of their files; none where either file is missing."""
-    questions = data / "questions" / str(variant.seed) / f"{asked}.jsonl"
-    answers = data / "answers" / variant.key / f"{said}.jsonl"
+    questions = root / layout.questions_file(variant.seed, asked)
+    answers = root / layout.answers_dir(variant) / f"{said}.jsonl"
     if not questions.is_file() or not answers.is_file():
         return []
     by_id = {q.question_id: q for q in read_jsonl(questions, Question)}

@@ -23,14 +23,13 @@ from filelock import FileLock, Timeout
 from pipeline.config import Params
 from pipeline.config.params import CHAIN, PARAMS_FILE, load_params
 from pipeline.core.io import code_of, remove_rests, sha256, write_json
+from pipeline.core.layout import CHECKPOINTS, DATA, MODELS, REPORTS, RUNS
 from pipeline.core.records import Measurement
-from pipeline.core.runtime import CHECKPOINTS, cores, limit_threads, processor, use_kernels
+from pipeline.core.runtime import cores, limit_threads, processor, use_kernels
 from pipeline.running.errors import UserError
 from pipeline.running.parallel import end_with_parent, use_backend
 from pipeline.running.progress import quiet_libraries
 
-DATA = Path("data")
-RUNS = Path("runs")
 TF32_VARIABLES = ("NVIDIA_TF32_OVERRIDE", "TORCH_ALLOW_TF32_CUBLAS_OVERRIDE")
 """Variables that turn TF32, which has float16's precision, on or off. They change results; some containers set them."""
 
@@ -125,7 +124,7 @@ def stage(name: str, key: str | None = None, *, launched: bool = False) -> Itera
             limit_threads(params.runtime.threads)
             use_backend(params.runtime.parallel)
             if _main_process():
-                for folder in (DATA, RUNS, Path("reports"), Path("models")):
+                for folder in (DATA, RUNS, REPORTS, MODELS):
                     remove_rests(folder)
                 print(f"{full}: starts ({params.report_name})", flush=True)
             before = _read_by(name, params)

@@ -1,4 +1,4 @@
-"""Choosing a scale: whether what it needs is there, and writing params.yaml, whole or not at all."""
+"""Choosing a scale: whether what it needs is there, what it costs, and writing params.yaml, whole or not at all."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from pipeline import weights
 from pipeline.config import Params
 from pipeline.config.params import PARAMS_FILE, compose, scale_names
 from pipeline.core.io import write_text
-from pipeline.core.records import Part, Touch
+from pipeline.core.layout import answers_dir, encoder_dir, trained_dir
+from pipeline.core.records import Lora, Part, Touch
 from pipeline.encoder.recipes import check_recipe
 from pipeline.language.start import objects_met
 from pipeline.running.errors import UserError
@@ -126,20 +127,15 @@ _Dumper.add_representer(
 )
 
 
-def prune(params: Params, data: Path) -> None:
+def prune(params: Params, root: Path) -> None:
     """Remove outputs of variants that params.yaml no longer names; DVC's cache brings them back when asked for.
 
     Stages that read a whole folder (`embed`, `grade`, `report`) would otherwise rerun because of what they do not use.
     """
-    variants, ablation = params.ablation.variants(), params.ablation
-    trained = {f"{v.encoder}-{v.opd}-{v.seed}" for v in variants}
-    keep: dict[str, set[str]] = {
-        "encoder": {str(seed) for seed in ablation.seeds},
-        "models/without": trained,
-        "models/with": trained,
-        "answers": {v.key for v in variants},
-    }
-    for folder, keys in keep.items():
-        for entry in (data / folder).glob("*"):
-            if entry.is_dir() and entry.name not in keys:
+    variants = params.ablation.variants()
+    keep = {root / encoder_dir(seed) for seed in params.ablation.seeds} | {root / answers_dir(v) for v in variants}
+    keep |= {root / trained_dir(v._replace(lora=lora)) for v in variants for lora in Lora}
+    for folder in {path.parent for path in keep}:
+        for entry in folder.glob("*"):
+            if entry.is_dir() and entry not in keep:
                 shutil.rmtree(entry)

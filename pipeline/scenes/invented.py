@@ -15,9 +15,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline.config import INVENTED, InventConfig, Params
+from pipeline.config import InventConfig, Params
 from pipeline.core.io import atomic_folder, code_of, fingerprint, write_text
-from pipeline.core.runtime import CHECKPOINTS, derive_seed
+from pipeline.core.layout import CHECKPOINTS, INVENTED
+from pipeline.core.runtime import derive_seed
 from pipeline.running.parallel import run_parallel
 from pipeline.scenes.contact import Method, press_by
 from pipeline.scenes.geometry import IMAGE_MM, heights

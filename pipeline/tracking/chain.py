@@ -15,13 +15,13 @@ import yaml
 from pipeline.config import Params
 from pipeline.config.params import CHAIN, PARAMS_FILE
 from pipeline.core.io import read_json, read_table
+from pipeline.core.layout import GRADED, REPORTS, RUNS
 from pipeline.core.records import Touch, Variant
 from pipeline.evaluation.records import Graded
 from pipeline.running.errors import UserError
-from pipeline.running.stage import DATA, RUNS
 from pipeline.tasks import TASKS
 
-REPORTS, CHAIN_LOCK = Path("reports"), Path("dvc.lock")
+CHAIN_LOCK = Path("dvc.lock")
 
 
 class ChainStage(NamedTuple):
@@ -92,14 +92,14 @@ def accuracies(params: Params) -> dict[str, dict[str, float]]:
     with another object's video; parts of an answer are named like `OPD.hardness`.
     """
     rows: Iterable[Mapping[str, Any]] = ()
-    table, graded = REPORTS / params.report_name / "scores.csv", DATA / "graded.parquet"
+    table = REPORTS / params.report_name / "scores.csv"
     if params.split.fold_of(0) is None:
         rows = csv.DictReader(table.read_text(encoding="utf-8").splitlines()) if table.is_file() else ()
-    elif graded.is_file():
+    elif GRADED.is_file():
         from pipeline.evaluation.scores import score_rows
         from pipeline.videos.catalogue import load_catalogue
 
-        own = [g.model_copy(update={"seed": g.trained}) for g in read_table(graded, Graded)]
+        own = [g.model_copy(update={"seed": g.trained}) for g in read_table(GRADED, Graded)]
         rows = map(dict, score_rows(own, load_catalogue(Path(params.data.catalogue))))
     found: dict[str, dict[str, float]] = {}
     for row in rows:

@@ -14,21 +14,11 @@ from typing import Any
 from pipeline.config import Params
 from pipeline.config.params import load_params
 from pipeline.core.io import read_json, read_table
+from pipeline.core.layout import HISTORY_FILE, MODELS, REPORTS, answers_dir, encoder_dir, trained_dir
 from pipeline.core.records import Encoder, Lora, Measurement, Variant
 from pipeline.running.errors import UserError
-from pipeline.running.stage import DATA
 from pipeline.tasks import TASKS
-from pipeline.tracking.chain import (
-    CHAIN_LOCK,
-    REPORTS,
-    ChainStage,
-    accuracies,
-    axes,
-    digest,
-    flatten,
-    read_stages,
-    settings,
-)
+from pipeline.tracking.chain import CHAIN_LOCK, ChainStage, accuracies, axes, digest, flatten, read_stages, settings
 from pipeline.tracking.store import KIND, LOCK, PARENT, STAGE, Store, TrackingError, cause, out_of_reach
 
 VARIANT, CONTENT, STATE = "octopi.variant", "octopi.content", "octopi.state"
@@ -101,7 +91,7 @@ def _complete(
         there = {(name, m.step) for name in run.data.metrics for m in store.client.get_metric_history(run_id, name)}
     else:
         run_id = store.create(title, "stage", began, settings(params, axes(title)), tags)
-    history = next((path for out in stage.outs if (path := Path(out) / "history.parquet").is_file()), None)
+    history = next((path for out in stage.outs if (path := Path(out) / HISTORY_FILE).is_file()), None)
     curve = read_table(history, Measurement) if history else []
     steps = max((m.step for m in curve), default=0) or 1
     points = [(m.name, m.value, began + (ended - began) * m.step // steps, m.step) for m in curve]
@@ -125,11 +115,9 @@ def _variants(
         stage = stages.get(f"answer@{variant.key}")
         if stage is None:
             continue
-        trained, metrics = f"{variant.encoder}-{variant.opd}-{variant.seed}", scores.get(variant.key, {})
-        made = {"predictions": DATA / "answers" / variant.key, "model": DATA / "models" / variant.lora / trained}
-        made["alignment"] = DATA / "models" / Lora.WITHOUT / trained
-        made["encoder"] = DATA / "encoder" / str(variant.seed)
-        made["package"] = Path("models") / variant.key
+        metrics, made = scores.get(variant.key, {}), {"predictions": answers_dir(variant)}
+        made |= {"model": trained_dir(variant), "alignment": trained_dir(variant._replace(lora=Lora.WITHOUT))}
+        made |= {"encoder": encoder_dir(variant.seed), "package": MODELS / variant.key}
         # A folder that is packaged is whole when it has its card.
         card = made["package"] / "config.json"
         content = digest([metrics, stage.outs, *([card.read_text(encoding="utf-8")] if card.is_file() else [])])

@@ -1,1 +1,1 @@
-"""What trainings of encoder and language model share: the Trainer, what is trained, the order of the data."""
+"""What trainings of encoder and language model share: the Trainer, what is trained, samples, embeddings, cards."""

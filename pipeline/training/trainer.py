@@ -26,8 +26,9 @@ from transformers.utils import SAFE_WEIGHTS_NAME
 
 from pipeline.config import EncoderConfig, PretrainConfig, RuntimeConfig, TrainConfig
 from pipeline.core.io import code_of, fingerprint
+from pipeline.core.layout import CHECKPOINTS
 from pipeline.core.records import Measurement
-from pipeline.core.runtime import CHECKPOINTS, limit_threads, resolve_device
+from pipeline.core.runtime import limit_threads, resolve_device
 from pipeline.running.errors import UserError
 from pipeline.running.progress import LogLines
 from pipeline.training.sampling import EpochDataset

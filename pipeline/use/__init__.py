@@ -1,4 +1,4 @@
-"""What a trained model is for: ask, describe, match, remember, serve, demo.
+"""What a trained model is for: ask, describe, match, remember, adapt, read a camera, serve, demo.
 
-In: a folder that the stage `package` wrote to models/, or the shipped one, which the stage `shipped` asks.
+In: a folder in models/, which the stage `package` writes, or the shipped one, which the stage `shipped` asks.
 """

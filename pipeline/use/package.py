@@ -10,9 +10,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
-from pipeline.config import LANGUAGE_DIR, PRETRAINED, Params
+from pipeline.config import LANGUAGE_DIR, Params
+from pipeline.core import layout
 from pipeline.core.io import atomic_folder, read_json, read_jsonl, read_table, save_tensors, sha256, write_json
-from pipeline.core.records import Encoder, Part, Question, Touch, Variant
+from pipeline.core.records import Encoder, Lora, Part, Question, Touch, Variant
 from pipeline.encoder.records import Classification
 from pipeline.evaluation.calibration import calibration_rows, fit_temperature
 from pipeline.evaluation.grading import conclude
@@ -58,25 +59,24 @@ LIMITS = (
 )
 
 
-def package(data: Path, params: Params, variant: Variant, base: Base, out: Path) -> None:
+def package(params: Params, variant: Variant, base: Base, out: Path) -> None:
     """Write one variant's folder.
 
     Args:
-        data: The chain's folder of data.
         base: The language model.
         out: The folder, made anew.
     """
     encoder, language = params.encoder, params.language
     catalogue = load_catalogue(Path(params.data.catalogue))
-    classified = read_table(data / "encoder" / str(variant.seed) / "classifications.parquet", Classification)
-    embeddings = data / "embeddings" / f"{variant.encoder}-{variant.seed}"
+    classified = read_table(layout.encoder_dir(variant.seed) / layout.CLASSIFIED_FILE, Classification)
+    embeddings = layout.embeddings_dir(variant.encoder, variant.seed)
     validated = [c for c in classified if c.part == Part.VALIDATION]
     temperatures = {
         p.name: fit_temperature([c for c in validated if c.property == p.name]) for p in catalogue.properties
     }
-    scores, ruled = _scores(data, params, variant, catalogue, classified)
+    scores, ruled = _scores(params, variant, catalogue, classified)
     with atomic_folder(out) as folder:
-        _copy(data / "encoder" / str(variant.seed) / TRAINED, folder / ENCODER_DIR / TRAINED)
+        _copy(layout.encoder_dir(variant.seed) / TRAINED, folder / ENCODER_DIR / TRAINED)
         files, card = backbone_files(encoder), Path(encoder.weights) / CARD_FILE
         if card.is_file() and any(file.parent == card.parent for file in files):
             files.append(card)
@@ -88,10 +88,9 @@ def package(data: Path, params: Params, variant: Variant, base: Base, out: Path)
                 folder / ENCODER_DIR / BACKBONE_DIR / STAGES, load_backbone(encoder, tuned=False).model.state_dict()
             )
         for file in files:
-            _copy(file, folder / ENCODER_DIR / (SCENES if file == PRETRAINED else f"{BACKBONE_DIR}/{file.name}"))
+            _copy(file, folder / ENCODER_DIR / (SCENES if file == layout.PRETRAINED else f"{BACKBONE_DIR}/{file.name}"))
         _copy(embeddings / STATISTICS_FILE, folder / ENCODER_DIR / STATISTICS_FILE)
-        key = f"{variant.encoder}-{variant.opd}-{variant.seed}"
-        trained, aligned = data / "models" / variant.lora / key, data / "models" / "without" / key
+        trained, aligned = layout.trained_dir(variant), layout.trained_dir(variant._replace(lora=Lora.WITHOUT))
         for file in (trained / CONFIG_FILE, *sorted(trained.glob("*.safetensors"))):
             _copy(file, folder / LANGUAGE_DIR / file.name)
         if (trained / ADAPTER_DIR).is_dir():
@@ -110,8 +109,8 @@ def package(data: Path, params: Params, variant: Variant, base: Base, out: Path)
             language=language,
             base=base,
             chat=chat_sample(load_tokenizer(Path(language.weights)), language),
-            quiet=quiet_level(read_table(data / "frames" / PROBES_FILE, Probe)),
-            usual=_largest_distance(embeddings, data / "splits" / f"{variant.seed}.parquet", params),
+            quiet=quiet_level(read_table(layout.FRAMES / PROBES_FILE, Probe)),
+            usual=_largest_distance(embeddings, layout.split_file(variant.seed), params),
             temperatures=temperatures,
             objects=read_json(aligned / OBJECTS_FILE),
             scores={task: score[1:4] for task, score in scores.items()},
@@ -119,7 +118,7 @@ def package(data: Path, params: Params, variant: Variant, base: Base, out: Path)
             versions={"python": platform.python_version(), **{name: metadata.version(name) for name in LIBRARIES}},
         )
         write_json(folder / CONFIG, config.model_dump(mode="json"))
-        known = read_json(Path("reports") / params.report_name / "provenance.json")["settings"]
+        known = read_json(layout.REPORTS / params.report_name / "provenance.json")["settings"]
         _write_card(folder, config, classified, scores, ruled, params, known)
 
 
@@ -154,7 +153,7 @@ class Score(NamedTuple):
 
 
 def _scores(
-    data: Path, params: Params, variant: Variant, catalogue: Catalogue, classified: Sequence[Classification]
+    params: Params, variant: Variant, catalogue: Catalogue, classified: Sequence[Classification]
 ) -> tuple[dict[str, Score], dict[str, Score]]:
     """By task, the accuracy of one model and of its encoder's heads with rules, where it has an interval.
 
@@ -162,10 +161,10 @@ def _scores(
     """
     graded = [
         g.model_copy(update={"seed": g.trained})
-        for g in read_table(data / "graded.parquet", Graded)
+        for g in read_table(layout.GRADED, Graded)
         if g.variant == variant and g.touch is Touch.REAL
     ]
-    asked = read_jsonl(data / "questions" / str(variant.seed) / "evaluation.jsonl", Question)
+    asked = read_jsonl(layout.questions_file(variant.seed), Question)
     taken = catalogue.asking(params.questions.scenarios).called(params.questions.names)
     heads = {variant.seed: conclude(asked, classified, taken)} if variant.encoder is Encoder.FINETUNED else {}
     found: dict[bool, dict[str, Score]] = {True: {}, False: {}}
@@ -211,7 +210,7 @@ def _write_card(
     if (folder / ENCODER_DIR / BACKBONE_DIR).is_dir():
         bases["tactile encoder"] = Path(params.encoder.weights)
     if "scenes" in params.encoder.backbone:
-        bases["tactile encoder, pretrained on synthetic scenes"] = PRETRAINED
+        bases["tactile encoder, pretrained on synthetic scenes"] = layout.PRETRAINED
     dataset = f"{params.data.source}, split {params.split.name}, test objects"
     results = [
         {

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from pipeline.config import SplitConfig
 from pipeline.core.io import read_table
+from pipeline.core.layout import split_file
 from pipeline.core.records import Part
 from pipeline.core.runtime import derive_seed
 from pipeline.running.errors import UserError
@@ -93,10 +94,10 @@ def without_videos(parts: Mapping[str, Part], present: Collection[str]) -> str:
     return "; ".join(said)
 
 
-def read_splits(data: Path, config: SplitConfig, seeds: Sequence[int]) -> dict[int, list[Assignment]]:
-    """The splits that differ, in the chain's data folder, by their first seed: one a fold with kfold, else one."""
+def read_splits(config: SplitConfig, seeds: Sequence[int], root: Path = Path()) -> dict[int, list[Assignment]]:
+    """The splits of the project in `root` that differ, by their first seed: one a fold with kfold, else one."""
     first = {config.fold_of(seed): seed for seed in reversed(seeds)}
-    return {seed: read_table(data / "splits" / f"{seed}.parquet", Assignment) for seed in sorted(first.values())}
+    return {seed: read_table(root / split_file(seed), Assignment) for seed in sorted(first.values())}
 
 
 def _deal(catalogue: Catalogue, present: Collection[str], config: SplitConfig, fold: int) -> dict[str, Part]:

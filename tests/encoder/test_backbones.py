@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.config import PRETRAINED
+from pipeline.core.layout import PRETRAINED
 from pipeline.core.records import Part
 from pipeline.core.runtime import seed_everything
 from pipeline.encoder import tuned

@@ -22,7 +22,8 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.preprocessing import StandardScaler
 from transformers import TrainerCallback
 
-from pipeline.config import PRETRAINED, Recipe
+from pipeline.config import Recipe
+from pipeline.core.layout import PRETRAINED
 from pipeline.core.records import Embedding, Flip, Part
 from pipeline.core.runtime import derive_seed, seed_everything
 from pipeline.encoder import finetune as module

@@ -20,6 +20,7 @@ from transformers import TrainerCallback, TrainerState
 
 from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig
 from pipeline.core.io import read_jsonl, write_jsonl
+from pipeline.core.layout import embeddings_dir, questions_file
 from pipeline.core.records import Encoder, Opd, Question
 from pipeline.language.chat import IGNORE_INDEX
 from pipeline.language.lora import add_lora
@@ -113,10 +114,13 @@ def test_killed_and_resumed_ends_the_same(kind: str, when: str, left: int, held:
     assert ended.history == whole.history, "what is trained waits for the stage to write it"
 
 
-def test_a_checkpoint_s_key_changes_with_each_input(held: Material, tmp_path: Path) -> None:
+def test_a_checkpoint_s_key_changes_with_each_input(
+    held: Material, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A checkpoint holds only what is trained: gone on with on other inputs, it would be neither's."""
-    weights, data, catalogue = (tmp_path / name for name in ("weights", "data", "catalogue"))
-    embeddings, asked = data / "embeddings" / "finetuned-0", data / "questions" / "0" / "train.jsonl"
+    monkeypatch.chdir(tmp_path)
+    weights, catalogue = tmp_path / "weights", tmp_path / "catalogue"
+    embeddings, asked = embeddings_dir(Encoder.FINETUNED, 0), questions_file(0, "train")
     shutil.copytree(ROOT / "pipeline" / "physiclear", catalogue)
     shutil.copytree(held.store.folder, embeddings)
     weights.mkdir()
@@ -125,12 +129,12 @@ def test_a_checkpoint_s_key_changes_with_each_input(held: Material, tmp_path: Pa
     params = compose("smoke", [f"language.weights={weights}", f"data.catalogue={catalogue}"], ROOT / "conf")
 
     def key() -> str:
-        return Material.load(data, params, Encoder.FINETUNED, Opd.ALL, 0).fingerprint(SMALL)
+        return Material.load(params, Encoder.FINETUNED, Opd.ALL, 0).fingerprint(SMALL)
 
     keys = [key()]
     assert key() == keys[0]
     shutil.copytree(embeddings, embeddings.with_name("words-0"))
-    assert Material.load(data, params, Encoder.WORDS, Opd.ALL, 0).fingerprint(SMALL) != keys[0]
+    assert Material.load(params, Encoder.WORDS, Opd.ALL, 0).fingerprint(SMALL) != keys[0]
     write_jsonl(asked, held.questions[1:])
     keys.append(key())
     for file in (weights / "model.safetensors", embeddings / STATISTICS_FILE, catalogue / "properties.yaml"):

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.config import InventConfig, ScenesConfig
 from pipeline.core.io import code_of, fingerprint
-from pipeline.core.runtime import CHECKPOINTS
+from pipeline.core.layout import CHECKPOINTS
 from pipeline.scales import check_inputs, compose
 from pipeline.scenes import invented
 from pipeline.scenes.elastic import solver

@@ -144,7 +144,7 @@ def make(where: Path, variant: Variant, *overrides: str) -> Made:
     report = where / "reports" / params.report_name
     write_json(report / "provenance.json", {"settings": "Looked at before."})
     out = where / "models" / variant.key
-    package(data, params, variant, Base.of(Path("llama")), out)
+    package(params, variant, Base.of(Path("llama")), out)
     return Made(out, videos, questions, predictions, classified, params, variant)
 
 

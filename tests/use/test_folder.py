@@ -63,7 +63,7 @@ def test_equal_inputs_give_equal_folders(made: Made, tmp_path: Path, monkeypatch
     moved["temperatures"] = {name: float(np.nextafter(t, 99)) for name, t in told["temperatures"].items()}
     assert ModelConfig.model_validate({**told, **moved}) == ModelConfig.model_validate(told)
     monkeypatch.chdir(made.folder.parents[1])
-    package(Path("data"), made.params, made.variant, Base.of(Path("llama")), tmp_path / "new")
+    package(made.params, made.variant, Base.of(Path("llama")), tmp_path / "new")
     assert contents(tmp_path / "new") == contents(made.folder)
 
 

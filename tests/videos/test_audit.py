@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import random
 import runpy
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -17,15 +15,12 @@ from pipeline.core.io import read_csv, write_table
 from pipeline.core.records import Part
 from pipeline.scales import compose, write_params
 from pipeline.videos.audit import leakage
-from pipeline.videos.audit.files import quiet_level, touches
 from pipeline.videos.audit.run import audit_chain, audit_folder, check_folder
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.files import list_videos
 from pipeline.videos.records import Assignment, Finding, Probe, Video
-from tests.audit_records import ERROR, GOOD_SPLIT, INFO, WARNING, assigned, look_at, odd, of, probe, probes
+from tests.audit_records import ERROR, GOOD_SPLIT, INFO, WARNING, assigned, odd, of, probe, probes
 from tests.closure import ROOT
-from tests.conftest import encode, moving_square, write_video
-from tests.frame_rules import decode
+from tests.conftest import moving_square, write_video
 
 pytestmark = pytest.mark.usefixtures("few_permutations")
 PAPER = SplitConfig(name="paper")
@@ -172,22 +167,3 @@ def test_odd_public_videos_are_found_without_being_told(public: list[Finding]) -
     assert float(hardness.measured.split()[0]) == pytest.approx(52, abs=6)
     assert float(hardness.expected.split()[0]) == pytest.approx(40, abs=4)
     assert float(hardness.measured.split()[-1]) < leakage.ALPHA
-
-
-@pytest.mark.slow
-@pytest.mark.real
-def test_copies_of_public_videos_are_found(real_data: Path, tmp_path: Path, catalogue: Catalogue) -> None:
-    """Of 24, encoded anew at a low rate, half of them brightened and shortened as well; no other pair is named."""
-    files = list_videos(real_data, catalogue).files
-    probes = [look_at(f.path, f.video_id) for f in files]
-    level = quiet_level(probes)
-    touched = [f for f, p in zip(files, probes, strict=True) if touches(p, level) and p.frames >= 50]
-    for number, file in enumerate(random.Random(0).sample(touched, 24)):
-        frames = list(decode(file.path))
-        if number % 2:
-            frames = [cv2.add(frame, np.full_like(frame, 12)) for frame in frames[len(frames) // 12 :]]
-        path = encode(tmp_path / f"copy{number}_0.mp4", frames, "mpeg4", "yuv420p", bits=400_000)
-        probes.append(look_at(path, path.stem))
-    named = [f.item for f in leakage.near_copies(probes, {}) if f.item != "all"]
-    assert 12 <= len(named) == len({*named})
-    assert {*named} <= {f"copy{number}_0.mp4" for number in range(24)}

@@ -100,16 +100,12 @@ def write(folder: Path, *lines: str, encoding: str = "utf-8", **more: Sequence[s
         ([HEADER, GOOD, GOOD], "line 3.*ball.*twice"),
         ([HEADER, GOOD, GOOD.replace("ball,a ball", "bowl,A Ball")], "line 3.*A Ball.*name of ball"),
         ([HEADER, GOOD.replace("1 1 2", "-1")], "line 2.*hardness.*0 to 2"),
-        ([HEADER, GOOD.replace("1 1 2", "1.5")], "line 2.*hardness.*0 to 2"),
         ([HEADER, GOOD.replace("a ball", "a ball, red")], "line 2.*11 fields for 10 columns.*quotation marks"),
         ([HEADER, GOOD.replace("train,train", "train,trian")], "line 2.*split_release.*trian.*validation"),
-        ([HEADER, GOOD.replace("a ball", "")], "line 2.*name"),
         ([HEADER, GOOD.replace("ball,", "../../evil,", 1)], r"line 2.*'\.\./\.\./evil'.*letters, digits"),
         ([HEADER, GOOD.replace("a ball", '"a ball'), *[GOOD.replace("ball", "b") for _ in range(3)]], "line 2.*open"),
-        ([f"{SHORT},label_hardness", f"{BALL},3"], "line 2.*label_hardness.*'3'.*0 to 2"),
         ([f"{SHORT},label_hardnes", f"{BALL},1"], r"objects\.csv.*label_hardnes .*no property"),
         ([f"{SHORT},split_kfold", f"{BALL},train"], "split_kfold.*rename"),
-        ([f"{SHORT},split_My own", f"{BALL},train"], "split_My own.*small letter"),
     ],
 )
 def test_a_bad_table_is_one_clear_line(tmp_path: Path, lines: list[str], words: str) -> None:
@@ -141,26 +137,18 @@ def test_texts_are_told_where_they_are_asked_for_and_packed_nowhere(tmp_path: Pa
         phrases.asking("published", "texts")
 
 
-def test_a_table_of_what_is_needed_alone_will_do(tmp_path: Path) -> None:
-    loaded = load_catalogue(write(tmp_path, SHORT, BALL))
-    ball = loaded.objects["ball"]
-    assert (ball.material, ball.part_of, ball.part, ball.description, ball.splits) == ("", "", "", "", {})
-    assert ball.stated == (None, None, None)
-    assert ball.ratings == ((1, 1, 2), (0,), (0, 0, 1))
-    assert ball.labels == (1, 0, 0)
-    assert loaded.split_names == ()
-
-
 def test_what_publishers_add(tmp_path: Path) -> None:
     lines = [f"label_roughness,{SHORT},label_hardness,split_mine,remark", f"2,{BALL},,validation,dented", f",{BOWL}"]
     described = ["description,object_id", '"Smooth, and soft.\nOld.",ball']
     loaded = load_catalogue(write(tmp_path, *lines, descriptions=described))
     ball, bowl = loaded.objects.values()
     assert (ball.stated, bowl.stated) == ((None, 2, None), (None, None, None))
+    assert (ball.material, ball.part_of, ball.part, ball.ratings) == ("", "", "", ((1, 1, 2), (0,), (0, 0, 1)))
     assert loaded.labels("ball") == (1, 0, 0), "labels follow from the ratings, whatever is stated"
     assert (ball.description, bowl.description) == ("Smooth, and soft.\nOld.", "")
     assert (ball.splits, bowl.splits) == ({"mine": Part.VALIDATION}, {"mine": Part.UNUSED})
     assert loaded.split_names == ("mine",)
+    assert load_catalogue(write(tmp_path, SHORT, BALL)).split_names == ()
 
 
 def test_a_spreadsheet_s_csv_is_read(tmp_path: Path) -> None:
@@ -186,17 +174,13 @@ def test_a_missing_or_broken_language_is_one_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"name": "Bumps"}, r"properties\.2\.name"),
         ({"name": "combined"}, "combined.*rename"),
         ({"name": "hardness"}, "hardness.*twice"),
-        ({"levels": ["flat"]}, r"properties\.2\.levels"),
         ({"levels": ["flat", "bumpy"]}, "bumpiness.*phrases.*a level"),
         ({"levels": ["flat", "hard to grip", "bumpy"]}, "hardness.*'hard'.*'hard to grip'"),
         ({"levels": ["surface", "raised", "bumpy"]}, "bumpiness.*'surface'.*structured"),
-        ({"cues": [["even"]]}, "bumpiness.*cues"),
         ({"cues": [["even"], [], ["small bumps"]]}, "bumpiness.*'small bumps'.*two levels"),
         ({"alone": "Overall, it has bumps."}, r"bumpiness.*alone.*\{level\}"),
-        ({"colour": "red"}, r"properties\.2\.colour"),
         ({"structured": "It is {hardness}, {roughness}, {bumpiness}."}, "structured.*Overall"),
         ({"unstructured": "{hardness}, {roughness}, {bumpiness}, {warmth}."}, "warmth"),
         ({"unstructured": "{hardness}, {roughness}."}, "does not name bumpiness"),
@@ -221,15 +205,11 @@ CATALOGUE = load_catalogue(PHYSICLEAR)
 @pytest.mark.parametrize(
     ("text", "hardness", "roughness", "bumpiness"),
     [
-        ("", set(), set(), set()),
         ("Hard and smooth, with no bumps.", {2}, {0}, {0}),
         ("It is MODERATELY\nhard.", {1}, set(), set()),
-        ("moderately-hard", {1}, set(), set()),
         ("It lacks noticeable roughness.", set(), {0}, set()),
-        ("noticeable roughness", set(), {2}, set()),
         ("not rough, and without bumps", set(), {0}, {0}),
         ("a slight roughness and small irregularities", set(), {1}, {1}),
-        ("no prominent bumps", set(), set(), {0}),
         ("prominent bumps, but not bumpy all over", set(), set(), {0, 2}),
         ("It is squishy where it is not hard.", {0}, set(), set()),
         ("hardly softened, roughly smoothed", set(), set(), set()),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import re
 from collections.abc import Callable, Sequence
 from fractions import Fraction
@@ -52,9 +51,9 @@ def message(store: Any, picture: np.ndarray, encoding: str, index: int, at: int)
     stamp = types["builtin_interfaces/msg/Time"](sec=at // 10**9, nanosec=at % 10**9)
     extra = {"seq": index} if "seq" in types["std_msgs/msg/Header"].__dataclass_fields__ else {}
     header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="gel", **extra)
-    if "png" in encoding or encoding == "broken":
+    if "png" in encoding:
         sent = picture[:, :, ::-1] if "compressed rgb" in encoding else picture
-        data = np.arange(40, dtype=np.uint8) if encoding == "broken" else cv2.imencode(".png", sent)[1].ravel()
+        data = cv2.imencode(".png", sent)[1].ravel()
         kind = "sensor_msgs/msg/CompressedImage"
         return types[kind](header=header, format=encoding, data=data), kind
     height, width = picture.shape[:2]
@@ -200,26 +199,24 @@ def test_what_is_no_recording_of_touch_is_refused_in_one_line(tmp_path: Path, pi
         times = (lambda i: EVEN(i) - (i >= 15) * late * 10**9), EVEN
         return write_bag(Path(mkdtemp(dir=tmp_path)), kind, sent, encoding, *times)
 
-    def cut_off(kind: str, share: float) -> Path:
+    def cut_off(kind: str) -> Path:
         whole = bag(*pictures[:30], kind=kind)
         file = next(p for p in (whole, *whole.glob("*")) if p.suffix in (".bag", ".mcap", ".db3"))
-        file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
+        file.write_bytes(file.read_bytes()[: file.stat().st_size // 3])
         return whole
 
     quiet = [shown for i, shown in enumerate(pictures) if not any(i in touched for touched in TOUCHED)]
     (text := tmp_path / "text.mcap").write_text("no bag")
     (empty := tmp_path / "empty").mkdir()
-    kinds, shares = ("ros1", "sqlite3", "mcap"), (0.9, 0.3, 0.0)
     for source, told, *options in (
         (tmp_path / "none.bag", "no such recording"),
         (bag(*quiet), "nothing touches the sensor in 78 pictures"),
         (bag(*pictures[:2], encoding="16UC1"), "encoding '16UC1'; send one of bgr8, 8UC3, rgb8, mono8, 8UC1"),
-        (bag(*pictures[:2], encoding="broken"), "is no picture that OpenCV reads"),
         (bag(pictures[0].astype(np.uint16) * 16, encoding="png"), "save it in 8 bits"),
         (bag(pictures[0], pictures[1][:-2]), "change their size"),
         *((bag(*pictures[:30], late=seconds), "its clock was set back") for seconds in (1, 3600)),
         *((source, "not a whole recording") for source in (text, empty)),
-        *((cut_off(kind, share), "copy it again") for kind, share in itertools.product(kinds, shares)),
+        *((cut_off(kind), "copy it again") for kind in ("ros1", "sqlite3", "mcap")),
         (bag(*pictures), "--object", "--object", "../rug"),
         (bag(pictures[0], kind="mcap"), f"/none is not in it; its image topics: {TOPIC}", "--topic", "/none"),
         (bag(pictures[0]), "/chatter holds std_msgs/msg/String and no images", "--topic", "/chatter"),
@@ -260,7 +257,6 @@ def test_a_long_video_and_a_folder_of_pictures_are_cut_as_a_bag_is(tmp_path: Pat
     cv2.imwrite(str(folder / "frame_3.png"), pictures[3][:-2])
     for source, options, words in (
         (folder, ["--fps", "25"], "frame_3.png: of another size"),
-        (folder, [], "say --fps"),
         (folder, ["--fps", "0.5"], "--fps takes 1 to 240"),
         (text, ["--fps", "25"], "no picture decodes"),
     ):

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from pipeline.config import FramesConfig
 from pipeline.use.frames import read_touch
 from pipeline.videos.decoding import Decoder, fit, planes
-from pipeline.videos.frames.reference import LONGEST, MOST_FRAMES, reference_indices, thumbnail
+from pipeline.videos.frames.reference import reference_indices, thumbnail
 from pipeline.videos.frames.subtraction import subtract
 from tests.conftest import encode, write_video
-from tests.frame_rules import Scanned, decode, frames_of, scanned
+from tests.frame_rules import Scanned, frames_of, scanned
 from tests.numerics.test_frames import subtracted
 
 WIDTH, HEIGHT = 120, 90
@@ -42,15 +42,6 @@ def filmed(path: Path, frames: list[np.ndarray], name: str = "contact", *, lossl
 def rise(count: int) -> list[float]:
     """Untouched for a fifth of the time, then contact to the end."""
     return [90 * max(0.0, (i / count - 0.2) / 0.8) for i in range(count)]
-
-
-@given(st.integers(0, 5000))
-def test_the_reference_spans_a_tenth_at_most(frames: int) -> None:
-    indices = reference_indices(frames)
-    assert indices[0] == 0
-    assert 1 <= len(indices) <= MOST_FRAMES
-    assert indices[-1] < max(1, min(LONGEST, frames // 10))
-    assert len(set(np.diff(indices).tolist())) <= 1
 
 
 @pytest.mark.parametrize(("count", "expected"), [(1, (0,)), (3, (0,)), (50, (0, 2, 4)), (126, (0, 2, 4, 6))])
@@ -135,19 +126,6 @@ def test_a_video_is_decoded_twice_at_most(tmp_path: Path, gains: list[float], op
     with patch.object(Decoder, "frames", autospec=True, side_effect=Decoder.frames) as decoded:
         scanned(path)
     assert decoded.call_count == opened
-
-
-@pytest.mark.slow
-@pytest.mark.real
-@pytest.mark.parametrize("name", ["potato_1", "masking_tape_0"])
-def test_real_presses_after_a_warm_up(real_data: Path, tmp_path: Path, name: str) -> None:
-    """At 25 and at 10 frames a second, where contact begins before a tenth of the video is steady."""
-    frames = list(decode(real_data / f"{name}.mov"))
-    steady = filmed(tmp_path / "steady.avi", frames, "contact", lossless=True)
-    warm = filmed(tmp_path / "warm.avi", warmed(frames, WARM_UP), "contact", lossless=True)
-    assert (steady.probe.unsteady, warm.probe.unsteady) == (0, 8)
-    assert warm.probe.contact == pytest.approx(steady.probe.contact, rel=0.1)
-    assert np.abs(warm.reference.astype(int) - steady.reference).mean() < 1
 
 
 def test_a_warm_up_is_noted_and_hides_no_lack_of_contact(tmp_path: Path) -> None:
