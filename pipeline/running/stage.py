@@ -20,7 +20,7 @@ from datetime import UTC, datetime
 from enum import StrEnum
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import yaml
 from filelock import FileLock, Timeout
@@ -67,9 +67,14 @@ def matrix_key(**axes: type[StrEnum] | None) -> list[Any]:
     Args:
         axes: The values of an axis; None for an axis of seeds.
 
-    Too few or too many values, or one that an axis lacks, end the process with its usage and status 2.
+    Too few or too many values, or one that an axis lacks, end the process with one line and status 1.
     """
-    parser = ArgumentParser(allow_abbrev=False)
+
+    class Parser(ArgumentParser):
+        def error(self, message: str) -> NoReturn:
+            sys.exit(f"{self.prog}: {message}; {' '.join(self.format_usage().split())}")
+
+    parser = Parser(sys.argv[0], add_help=False)
     for axis, values in axes.items():
         parser.add_argument(axis, type=values or int, choices=values)
     return list(vars(parser.parse_args()).values())
