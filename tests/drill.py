@@ -94,14 +94,6 @@ class Drill:
         log = self.folder.with_name("run.txt")
         return self.start(log).wait(LONGEST), log.read_text()
 
-    def forget(self, stage: str) -> None:
-        """Take away what a stage made, here and from DVC's cache: it alone has to run again."""
-        (self.folder / "struck").unlink(missing_ok=True)
-        for entry in self.expected[stage]["outs"]:
-            (self.folder / ".dvc/cache/files/md5" / entry["md5"][:2] / entry["md5"][2:]).unlink(missing_ok=True)
-            out = self.folder / entry["path"]
-            shutil.rmtree(out) if out.is_dir() else out.unlink(missing_ok=True)
-
     def kill(self, seed: str) -> bool:
         """Let a stage run again, kill something on the way, and look; False where it was through before.
 
@@ -110,7 +102,12 @@ class Drill:
         rng, number = random.Random(seed), int(seed.rpartition("/")[2])
         name, event, pattern, where = MOMENTS[number // 2 % len(MOMENTS)] if number % 2 else ("at random", "", "", "")
         stage = rng.choice([title for title in self.expected if title != "publish" and re.match(where, title)])
-        self.forget(stage)
+        (struck := self.folder / "struck").unlink(missing_ok=True)
+        # Without what it made, here and in DVC's cache, this stage alone has to run again.
+        for entry in self.expected[stage]["outs"]:
+            (self.folder / ".dvc/cache/files/md5" / entry["md5"][:2] / entry["md5"][2:]).unlink(missing_ok=True)
+            out = self.folder / entry["path"]
+            shutil.rmtree(out) if out.is_dir() else out.unlink(missing_ok=True)
         log = self.folder.with_name("killed.txt")
         leader = self.start(log, DRILL_STRIKE=json.dumps([event, pattern] if event else None))
 
@@ -118,7 +115,7 @@ class Drill:
             """The stage's process, once there is one."""
             return alive(leader.pid, f"stages/{stage.partition('@')[0]}.py")[:1]
 
-        struck, output, whom = self.folder / "struck", "", rng.choice(("stage", "stage", "dvc", "group"))
+        output, whom = "", rng.choice(("stage", "stage", "dvc", "group"))
         # DVC does not hear Ctrl-C while a stage runs.
         how = rng.choice((signal.SIGKILL, signal.SIGTERM, *([signal.SIGINT] if whom != "dvc" else [])))
         wait_until(lambda: (struck.exists() if event else running()) or leader.poll() is not None)

@@ -370,8 +370,7 @@ def test_two_workers_make_the_same_bytes_on_either_backend(
     run_script(SCRIPT, tmp_path, backend, str(tiny_videos), str(ROOT / "pipeline" / "physiclear"))
     refused, died = (tmp_path / "said").read_text().splitlines()
     assert refused == "file 7 is broken; mend it"
-    assert died.startswith("numbers: a process died at or soon after "), died
-    assert died.endswith("Run again")
+    assert died.startswith("numbers: a process died at dies; "), died
     # No worker outlives the work.
     wait_until_ended(p for p in psutil.process_iter(["cwd"]) if p.info["cwd"] == str(tmp_path))
     assert hashes(tmp_path / "out") == made_alone

@@ -18,7 +18,7 @@ from pipeline.core.records import Encoder, Lora, Measurement, Opd, Variant
 from pipeline.encoder.embed import EncoderSource
 from pipeline.running import parallel
 from pipeline.running.errors import UserError
-from pipeline.running.parallel import _loaded, _there, use_backend
+from pipeline.running.parallel import _loaded, use_backend
 from pipeline.running.stage import running_stages, stage
 from pipeline.scales import check_inputs, compose, write_params
 from tests.closure import ROOT
@@ -146,10 +146,7 @@ def test_records_are_of_the_code_beside_them(clone: Path, monkeypatch: pytest.Mo
     assert sorted(clone.rglob("*")) == before
 
 
-def test_a_worker_and_a_stage_in_a_wrong_folder_refuse(clone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(clone.parent)  # A worker goes to the project's folder itself.
-    with refused("dvc.lock records"):
-        _there(str(clone), len, "")
+def test_a_stage_in_a_wrong_folder_refuses(clone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(clone / "stages")
     with pytest.raises(SystemExit, match=f"go to {clone}, the project's folder"), stage("split"):
         pass

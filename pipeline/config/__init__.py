@@ -10,19 +10,22 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, Strict, field_validator, model_validator
 
 from pipeline.core.layout import PRETRAINED, SCENES_DIR
 from pipeline.core.records import Encoder, Lora, Opd, Touch, Variant
 from pipeline.core.runtime import DeviceName, DtypeName, Kernels, Quantization
 from pipeline.running.errors import without_secrets
 
-Fraction = Annotated[float, Field(gt=0, le=1)]
-Positive = Annotated[int, Field(ge=1)]
-Rate = Annotated[float, Field(gt=0, lt=10)]
-GradNorm = Annotated[float, Field(ge=0)]
-Seed = Annotated[int, Field(ge=0, lt=2**31)]
-QuestionCounts = dict[str, Annotated[int, Field(ge=0)]]
+Whole = Annotated[int, Strict()]
+"""Strict, since Python counts `true` as 1, and so `epochs: true` would train for one epoch."""
+Number = Annotated[float, Strict()]
+Fraction = Annotated[Number, Field(gt=0, le=1)]
+Positive = Annotated[Whole, Field(ge=1)]
+Rate = Annotated[Number, Field(gt=0, lt=10)]
+GradNorm = Annotated[Number, Field(ge=0)]
+Seed = Annotated[Whole, Field(ge=0, lt=2**31)]
+QuestionCounts = dict[str, Annotated[Whole, Field(ge=0)]]
 """Questions of each task; `pipeline.tasks.questions.counts_by_task` knows which tasks there are."""
 
 Recipe = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]*$")]
@@ -41,18 +44,6 @@ class Section(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    @model_validator(mode="before")
-    @classmethod
-    def _true_is_no_number(cls, values: object) -> object:
-        """Python counts `true` as 1, and so `epochs: true` would train for one epoch."""
-        for name, value in values.items() if isinstance(values, dict) else ():
-            kind = cls.model_fields[name].annotation if name in cls.model_fields else bool
-            inner = value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else [value]
-            section = isinstance(kind, type(BaseModel))  # Which looks at its own values.
-            if kind is not bool and not section and any(isinstance(each, bool) for each in inner):
-                raise ValueError(f"{name} is {str(value).lower()}, but no switch")
-        return values
-
 
 class DataConfig(Section):
     """Where the videos come from."""
@@ -69,7 +60,7 @@ class DataConfig(Section):
 class InventConfig(Section):
     """A catalogue of invented objects (used where data.catalogue is data/invented)."""
 
-    objects: Annotated[int, Field(ge=27, le=100_000)] = 1500
+    objects: Annotated[Whole, Field(ge=27, le=100_000)] = 1500
     """All 27 combinations of three properties' classes come equally often."""
     seed: Seed = 0
 
@@ -80,19 +71,19 @@ class ScenesConfig(Section):
     objects: tuple[str, ...] = ()
     """Object ids; empty stands for all of the catalogue."""
     videos_per_object: Positive = 5
-    frames: Annotated[int, Field(ge=2, le=1000)] = 100
+    frames: Annotated[Whole, Field(ge=2, le=1000)] = 100
     """Frames a video."""
-    fps: Annotated[float, Field(gt=0, le=240)] = 25.0
+    fps: Annotated[Number, Field(gt=0, le=240)] = 25.0
     """Frames a second."""
     tier: Literal["auto", "winkler", "layer", "half_space"] = "auto"
     """How a contact is computed: on springs, with the gel as an elastic layer or as a half-space; `auto` takes what is
     cheapest within `tolerance`."""
-    cells: Annotated[int, Field(ge=32, le=1024)] = 256
+    cells: Annotated[Whole, Field(ge=32, le=1024)] = 256
     """`layer`, `half_space`: grid across the pressed patch."""
-    tolerance: Annotated[float, Field(gt=0, le=1)] = 0.25
+    tolerance: Annotated[Number, Field(gt=0, le=1)] = 0.25
     """`auto`: estimated relative error in the slopes of the gel's skin."""
-    width: Annotated[int, Field(ge=32, le=1280, multiple_of=2)] = 320
-    height: Annotated[int, Field(ge=24, le=960, multiple_of=2)] = 240
+    width: Annotated[Whole, Field(ge=32, le=1280, multiple_of=2)] = 320
+    height: Annotated[Whole, Field(ge=24, le=960, multiple_of=2)] = 240
     """Even, as the videos' codec wants it."""
     seed: Seed = 0
 
@@ -105,9 +96,9 @@ class FramesConfig(Section):
     the largest differences to the no-contact reference."""
     fraction: Fraction = 0.3
     """Share of a video's frames that is kept (paper: 30 %)."""
-    per_video: Annotated[int, Field(ge=1, le=64)] = 5
+    per_video: Annotated[Whole, Field(ge=1, le=64)] = 5
     """Frames drawn of those that are kept (paper: 5)."""
-    pixels: Annotated[int, Field(ge=16, le=1024)] = 224
+    pixels: Annotated[Whole, Field(ge=16, le=1024)] = 224
     """Side of the square that frames are stored at; a CLIP's own or more, as larger frames are averaged. No key may be
     called `size` or `nfiles`: DVC's run cache leaves those out."""
     fit: Literal["crop", "squash"] = "crop"
@@ -123,10 +114,10 @@ class SplitConfig(Section):
     """Used by development and kfold."""
     test_objects: Positive = 7
     """Test objects of the development split."""
-    train_objects: Annotated[int, Field(ge=0)] = 0
+    train_objects: Annotated[Whole, Field(ge=0)] = 0
     """`kfold`: train on this many of a fold's training objects, to see how many are enough; 0: all. A larger number
     includes all objects of a smaller one."""
-    folds: Annotated[int, Field(ge=3, le=50)] = 5
+    folds: Annotated[Whole, Field(ge=3, le=50)] = 5
     """`kfold`: number of folds. Seed s of `ablation.seeds` tests on fold s modulo `folds`."""
     missing: Literal["report", "error"] = "report"
     """What to do about validation or test objects without videos: go on and leave cells empty, or stop."""
@@ -166,16 +157,16 @@ class QuestionsConfig(Section):
     them: then no knowledge of the world is asked for. Tables say so."""
     names: Literal["catalogue", "number"] = "catalogue"
     """What objects are called. `number`: "object 7", as in the training of the shipped model, which copies no other."""
-    inexact: Annotated[float, Field(ge=0, le=1)] = 0.0
+    inexact: Annotated[Number, Field(ge=0, le=1)] = 0.0
     """`facts` in training: probability that a stated class is a neighbour of the right one; the right matching stays
     the nearest. An encoder errs so, and from exact facts the model would learn to look for equal classes alone."""
     restate: bool = False
     """Where everything is described (OPD `all`), answers to PC and PSS name the classes of the property asked for, and
     which object has more or less of it, before they conclude: for a model too small to find and compare at once."""
-    two_turns: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    two_turns: Annotated[Number, Field(ge=0, lt=1)] = 0.0
     """Share of the training questions about several videos that become a dialogue in OPD mode `all`: the first turn
     describes all videos, as in scenarios (PSR), and each later one asks a question about them."""
-    plainly: Annotated[float, Field(ge=0, le=1)] = 0.0
+    plainly: Annotated[Number, Field(ge=0, le=1)] = 0.0
     """Share of the other training comparisons that are asked as people do: "Which is softer?"."""
 
 
@@ -191,29 +182,29 @@ class EncoderConfig(Section):
     weights: str
     """Folder of `clip` in open_clip's format (open_clip_config.json and open_clip_model.safetensors), or of `timm` in
     timm's (config.json and model.safetensors). The chain makes what is named below data/weights/."""
-    feature_stage: Annotated[int, Field(ge=0, le=200)] = 3
+    feature_stage: Annotated[Whole, Field(ge=0, le=200)] = 3
     """`timm`: which of the network's stages (a transformer: blocks) is read, from 0 on; what follows is not used."""
     embedding: Literal["projected", "class_token", "logits"] = "projected"
     """`paper`: what is read of CLIP, for the heads and the language model (ViT-L/14: 768 or 1024 values). `projected`:
     CLIP's own embedding. `class_token`: the normalised class token before CLIP's projection. `release` reads the
     class token in any case: normalised for the heads, and before that for the language model. `logits`: with any
     encoder, the property heads' logits of each frame; for training objects, from heads that did not see them."""
-    prompts: Annotated[int, Field(ge=1, le=256)] = 8
+    prompts: Annotated[Whole, Field(ge=1, le=256)] = 8
     """Learnable prompts at each layer."""
-    prompt_layers: Annotated[int, Field(ge=0)] = 0
+    prompt_layers: Annotated[Whole, Field(ge=0)] = 0
     """Layers, from the first, that get prompts of their own; 0 is all (paper)."""
     epochs: Positive = 30
     batch_size: Positive = 32
-    micro_batch_size: Annotated[int, Field(ge=0)] = 0
+    micro_batch_size: Annotated[Whole, Field(ge=0)] = 0
     """Videos per forward pass; gradients are accumulated up to `batch_size`. 0, or `batch_size` and more: all at once.
     `octopi scale` says what memory that takes."""
     autocast: Literal["none", "bfloat16"] = "none"
     """Mixed precision: the number format of torch's autocast in training. Trained weights stay in float32."""
     learning_rate: Rate = 1e-3
-    weight_decay: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    weight_decay: Annotated[Number, Field(ge=0, lt=1)] = 0.0
     max_grad_norm: GradNorm = 0.0
     """Clip gradients to this norm; 0 does not clip (the published code; the paper does not say)."""
-    flip_probability: Annotated[float, Field(ge=0, le=1)] = 0.5
+    flip_probability: Annotated[Number, Field(ge=0, le=1)] = 0.5
     """Chance of each of the two flips in training."""
     reference: Literal["none", "subtract"] = "none"
     """`subtract`: show each frame's difference to the video's no-contact reference in place of the frame."""
@@ -247,16 +238,16 @@ class PretrainConfig(Section):
     """Pretraining of the backbone `scenes` on pictures of invented objects. It has no micro-batches, since batch
     normalisation needs the whole update."""
 
-    objects: Annotated[int, Field(ge=8, le=1_000_000)] = 4000
+    objects: Annotated[Whole, Field(ge=8, le=1_000_000)] = 4000
     """Objects that are invented; each is drawn once."""
-    presses: Annotated[int, Field(ge=1, le=64)] = 3
+    presses: Annotated[Whole, Field(ge=1, le=64)] = 3
     """Pictures of each, under different forces and lights."""
     steps: Positive = 900
     """Updates (AdamW, cosine)."""
     batch_size: Positive = 24
     """Objects an update."""
     learning_rate: Rate = 2e-3
-    weight_decay: Annotated[float, Field(ge=0, lt=1)] = 0.01
+    weight_decay: Annotated[Number, Field(ge=0, lt=1)] = 0.01
     max_grad_norm: GradNorm = 1.0
     augment: bool = True
     """Vary how strong each picture's light is, and mirror it."""
@@ -291,7 +282,7 @@ class LanguageConfig(Section):
     """Scale each projected tactile embedding to the root mean square of the word embeddings. Otherwise alignment at a
     high learning rate makes them a hundred times as long, which drowns what attention adds, such as which video they
     show."""
-    max_new_tokens: Annotated[int, Field(ge=1, le=4096)] = 256
+    max_new_tokens: Annotated[Whole, Field(ge=1, le=4096)] = 256
     """Length of an answer, less where the language model has no more positions. Longer answers are cut and marked."""
     generation_batch_size: Positive = 32
 
@@ -315,8 +306,8 @@ class TrainConfig(Section):
     """Learning rate of the projection, and of word embeddings where they are trained."""
     projection_schedule: Literal["cosine", "constant"] = "cosine"
     """Schedule of the projection's learning rate (published code: `constant`); the other rates follow a cosine."""
-    warmup_ratio: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    weight_decay: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    warmup_ratio: Annotated[Number, Field(ge=0, lt=1)] = 0.0
+    weight_decay: Annotated[Number, Field(ge=0, lt=1)] = 0.0
 
     @model_validator(mode="after")
     def _batches_divide(self) -> Self:
@@ -341,13 +332,13 @@ class LoraTrainConfig(TrainConfig):
 
     learning_rate: Rate = 2e-4
     """Learning rate of the adapters."""
-    rank: Annotated[int, Field(ge=1, le=1024)] = 128
-    alpha: Annotated[float, Field(gt=0)] = 256.0
-    dropout: Annotated[float, Field(ge=0, lt=1)] = 0.05
+    rank: Annotated[Whole, Field(ge=1, le=1024)] = 128
+    alpha: Annotated[Number, Field(gt=0)] = 256.0
+    dropout: Annotated[Number, Field(ge=0, lt=1)] = 0.05
     target_modules: Literal["all-linear"] | Annotated[tuple[str, ...], Field(min_length=1)] = ("q_proj", "k_proj")
     """Linear layers that get an adapter (the paper does not say; the published code: q_proj and k_proj); `all-linear`:
     all but the one that gives the logits."""
-    given: Annotated[float, Field(ge=0, le=1)] = 0.0
+    given: Annotated[Number, Field(ge=0, le=1)] = 0.0
     """Share of the questions about several videos that get another question's videos, with their descriptions left out
     of the loss: the model must then conclude from the description and not from touch."""
     skip_contradicted: bool = False
@@ -402,7 +393,7 @@ class TrackingConfig(Section):
     experiment: str = "octopi"
     live: bool = True
     """Log trainings while they run (importing MLflow costs each of them seconds), or only when all is done."""
-    timeout_seconds: Annotated[int, Field(ge=1, le=600)] = 10
+    timeout_seconds: Annotated[Whole, Field(ge=1, le=600)] = 10
     """After how long an unanswered call counts as a dead server."""
 
     @field_validator("uri")
@@ -425,9 +416,9 @@ class RuntimeConfig(Section):
     parallel: Backend = "processes"
     """Where many files are worked on at once: `processes` of this machine, or `ray`, a cluster that `RAY_ADDRESS` names
     (without it: one of this machine's cores)."""
-    threads: Annotated[int, Field(ge=0, le=1024)] = 0
+    threads: Annotated[Whole, Field(ge=0, le=1024)] = 0
     """CPU threads of torch; 0 leaves it to torch. Sums depend on it in their last bits, so fix it to compare runs."""
-    save_steps: Annotated[int, Field(ge=0)] = 0
+    save_steps: Annotated[Whole, Field(ge=0)] = 0
     """Optimiser steps between checkpoints that a killed training resumes from; 0 writes none."""
     gradient_checkpointing: bool = False
 
@@ -453,7 +444,7 @@ class Params(Section):
     align: AlignConfig
     lora: LoraTrainConfig
     ablation: AblationConfig
-    shipped: Annotated[int, Field(ge=0)] = 0
+    shipped: Annotated[Whole, Field(ge=0)] = 0
     """Number of questions about this run's videos for the shipped model (`pipeline/pretrained`)."""
     packaged: Literal["full", "all"] = "full"
     """Which variants get a folder in models/: the full system of each seed, or all. Each holds the whole encoder."""

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from importlib.util import find_spec
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -109,55 +109,49 @@ def _loaded(source: Callable[[], Any]) -> Any:
 
 
 def _in_processes(work: Callable[[J], R], jobs: Sequence[J], label: str) -> Iterator[R]:
-    """In as many processes as there are cores, each with a pipe of its own, which closes where it dies.
+    """In a process for each core, which does every so-manieth job, and has a pipe that closes where it dies.
 
     Linux forks, since a fresh interpreter costs more than many whole videos; elsewhere the platform's way is used, and
     the caller's script needs a main guard.
     """
     context = multiprocessing.get_context("fork" if sys.platform == "linux" else None)
-    workers, found, taken = dict[Connection, Any](), dict[int, Any](), context.Value("q")
+    count, pipes, workers = min(cores(), len(jobs)), list[Connection](), list[Any]()
     # Workers inherit the blocked SIGINT, so that on Ctrl-C only this process reacts, and ends them.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        for _ in range(min(cores(), len(jobs))):
+        for number in range(count):
             here, there = context.Pipe(duplex=False)
-            workers[here] = context.Process(target=_take, args=(os.getpid(), work, jobs, taken, there), daemon=True)
-            workers[here].start()
+            given = os.getpid(), work, jobs[number::count], there
+            worker: Any = context.Process(target=_take, args=given, daemon=True)
+            worker.start()
+            workers.append(worker)
+            pipes.append(here)
             there.close()
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         for number, job in enumerate(jobs):
-            while number not in found:
-                ready: Any = wait(workers)
-                for pipe in ready:
-                    try:
-                        done, *found[done] = pipe.recv()
-                    except (EOFError, OSError):
-                        raise _died(label, job) from None
-            result, error = found.pop(number)
+            try:
+                result, error = pipes[number % count].recv()
+            except (EOFError, OSError):
+                raise _died(label, job) from None
             if error is not None:
                 raise error
             yield result
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        for worker in workers.values():
+        for worker in workers:
             worker.kill()
-        for worker in workers.values():
             worker.join()
 
 
-def _take(parent: int, work: Callable[[J], R], jobs: Sequence[J], taken: Any, pipe: Connection) -> None:
-    """What a worker does until it is ended: take the next job, and hand over its number, result and error."""
+def _take(parent: int, work: Callable[[J], R], jobs: Sequence[J], pipe: Connection) -> None:
+    """What a worker does: hand over each job's result, or its error."""
     end_with_parent(parent)
-    while True:
-        with taken.get_lock():
-            number, taken.value = taken.value, taken.value + 1
-        if number >= len(jobs):
-            threading.Event().wait()
+    for job in jobs:
         try:
-            pipe.send((number, work(jobs[number]), None))
+            pipe.send((work(job), None))
         except Exception as error:
             error.add_note(traceback.format_exc())  # Which does not travel.
-            pipe.send((number, None, error))
+            pipe.send((None, error))
 
 
 def _on_ray(work: Callable[[J], R], jobs: Sequence[J], label: str, device: bool) -> Iterator[R]:
@@ -177,8 +171,14 @@ def _on_ray(work: Callable[[J], R], jobs: Sequence[J], label: str, device: bool)
     # Ray hides GPUs from work that does not ask for them.
     gpus = 1 if device and ray.cluster_resources().get("GPU") else 0
     folder = os.getcwd()
-    remote = ray.remote(num_gpus=gpus)(lambda job: _there(folder, work, job))
-    waiting = deque(remote.remote(job) for job in jobs)
+
+    def there(job: J) -> R:
+        """In a worker: go to the project's folder, since jobs name files relative to it."""
+        os.chdir(folder)
+        check_code(Path())
+        return work(job)
+
+    waiting = deque(map(ray.remote(num_gpus=gpus)(there).remote, jobs))
     for job in jobs:
         try:
             yield ray.get(waiting.popleft())
@@ -188,12 +188,5 @@ def _on_ray(work: Callable[[J], R], jobs: Sequence[J], label: str, device: bool)
             raise _died(label, job) from None
 
 
-def _there(folder: str, work: Callable[[J], R], job: J) -> R:
-    """Run a job in a worker, from the project's folder, since jobs name files relative to it."""
-    os.chdir(folder)
-    check_code(Path())
-    return work(job)
-
-
 def _died(label: str, job: object) -> UserError:
-    return UserError(f"{label}: a process died at or soon after {job}; was it killed for want of memory? Run again")
+    return UserError(f"{label}: a process died at {job}; was it killed for want of memory? Run again")

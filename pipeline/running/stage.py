@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import hashlib
+import json
 import logging
 import os
 import re
@@ -10,14 +12,17 @@ import shlex
 import shutil
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from argparse import ArgumentParser
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from enum import StrEnum
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
+import yaml
 from filelock import FileLock, Timeout
 
 from pipeline.config import Params
@@ -55,24 +60,23 @@ class Stage:
         self.metrics["steps"] = max((m.step for m in history), default=0)
 
 
-def matrix_key(**axes: Iterable[Any] | None) -> list[Any]:
+def matrix_key(**axes: type[StrEnum] | None) -> list[Any]:
     """Which stage of a matrix this process is: a value of each axis, in order, from the command line.
 
     Args:
-        axes: The values of an axis, known by how they are printed; None for an axis of seeds.
+        axes: The values of an axis; None for an axis of seeds.
 
     Too few or too many values, or one that an axis lacks, end the process with one line and status 1.
     """
-    script, given = Path(sys.argv[0]), sys.argv[1:]
-    seeds = {word: int(word) for word in given if word.isdecimal()}
-    known = [seeds if values is None else {str(value): value for value in values} for values in axes.values()]
-    if len(given) == len(known) and all(word in values for word, values in zip(given, known, strict=True)):
-        return [values[word] for word, values in zip(given, known, strict=True)]
-    takes = (
-        f"<{axis}: {', '.join(map(str, ['0', '1', '...'] if values is None else values))}>"
-        for axis, values in axes.items()
-    )
-    sys.exit(f"{script.stem}: not {' '.join(given)!r}; call it as python stages/{script.name} {' '.join(takes)}")
+
+    class Parser(ArgumentParser):
+        def error(self, message: str) -> NoReturn:
+            sys.exit(f"{self.prog}: {message}; {' '.join(self.format_usage().split())}")
+
+    parser = Parser(sys.argv[0], add_help=False)
+    for axis, values in axes.items():
+        parser.add_argument(axis, type=values or int, choices=values)
+    return list(vars(parser.parse_args()).values())
 
 
 def launch(launcher: str) -> None:
@@ -113,8 +117,9 @@ def stage(name: str, key: str | None = None, *, launched: bool = False) -> Itera
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     quiet_libraries()
     try:
-        if number := next((name for name in TF32_VARIABLES if name in os.environ), None):
-            raise UserError(f"{number} is set, which changes the format that numbers are computed in; unset it")
+        for variable in TF32_VARIABLES:
+            if variable in os.environ:
+                raise UserError(f"{variable} is set, which changes the format that numbers are computed in; unset it")
         params = load_params()
         use_kernels(params.kernels)
         if launched:
@@ -130,7 +135,7 @@ def stage(name: str, key: str | None = None, *, launched: bool = False) -> Itera
             before = _read_by(name, params)
             yield running
             now = _read_by(name, params)
-            changed = [file for file in before.keys() | now.keys() if before.get(file) != now.get(file)]
+            changed = [file for file, _ in before.items() ^ now.items()]
             changed += [PARAMS_FILE] if load_params() != params else []
             if changed:
                 file = os.path.relpath(min(changed))
@@ -238,17 +243,20 @@ def _write_run(running: Stage) -> None:
 
 def _outs(running: Stage) -> dict[str, str]:
     """Hashes of a stage's outputs by path, as dvc.lock will have them: other runs' have others."""
-    import yaml
-    from dvc_data.hashfile.build import build
-    from dvc_data.hashfile.db import HashFileDB
-    from dvc_objects.fs.local import localfs
-
     name, _, key = running.name.partition("@")
     listed = yaml.safe_load(CHAIN.read_bytes())["stages"].get(name, {}) if CHAIN.is_file() else {}
     outs = [str(*out) if isinstance(out, dict) else out for kind in ("outs", "metrics") for out in listed.get(kind, ())]
     # A stage of a matrix is called by its values with hyphens between, as what it writes is.
     named = re.sub(r"\$\{item\..*\}", key, "\n".join(outs))
     paths = re.sub(r"\$\{([\w.]+)\}", lambda name: str(attrgetter(name[1])(running.params)), named).splitlines()
-    made = {path: os.path.abspath(path) for path in paths if Path(path).exists()}
-    cache = HashFileDB(localfs, "")  # Of which a dry run has no use.
-    return {path: build(cache, at, localfs, "md5", dry_run=True)[2].hash_info.value for path, at in made.items()}
+    return {path: _md5(Path(path)) for path in paths if Path(path).exists()}
+
+
+def _md5(path: Path) -> str:
+    """The MD5 by which DVC knows a file, or a folder: that of a list of its files in JSON."""
+    if path.is_file():
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "md5").hexdigest()
+    files = sorted((file.relative_to(path).as_posix(), file) for file in path.rglob("*") if file.is_file())
+    listed = [{"md5": _md5(file), "relpath": name} for name, file in files]
+    return f"{hashlib.md5(json.dumps(listed).encode()).hexdigest()}.dir"

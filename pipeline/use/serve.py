@@ -23,7 +23,7 @@ from starlette.requests import ClientDisconnect
 
 from pipeline.running.errors import UserError
 from pipeline.use.media import PLACE, Gate
-from pipeline.use.protocol import ChatRequest, Json, Reply, read_conversation, read_request
+from pipeline.use.protocol import Json, Reply, read_conversation, read_request
 from pipeline.use.results import Exchange
 from pipeline.use.server import Failed, Worker, listen, make_server
 
@@ -65,16 +65,16 @@ def read_token(file: Path | None) -> str:
     return token
 
 
-async def _read(request: Request, most: int) -> bytes:
-    """The body of at most so many bytes."""
+async def _read(request: Request) -> bytes:
+    """The body of a request."""
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
         # A page of another site may send other types without asking the browser's leave.
         raise HTTPException(415, "send Content-Type: application/json")
     data = bytearray()
     async for chunk in request.stream():
         data += chunk
-        if len(data) > most:
-            raise HTTPException(413, f"the request is larger than {most} bytes; send fewer or shorter videos")
+        if len(data) > MOST_BYTES:
+            raise HTTPException(413, f"the request is larger than {MOST_BYTES} bytes; send fewer or shorter videos")
     return bytes(data)
 
 
@@ -111,7 +111,7 @@ def _error(error: Exception) -> tuple[Json, int]:
     return {"error": told}, status
 
 
-def make_app(model: Octopi, name: str, *, token: str = "", places: int = 32, most_bytes: int = MOST_BYTES) -> FastAPI:
+def make_app(model: Octopi, name: str, *, token: str = "", places: int = 32) -> FastAPI:
     """The web application.
 
     Args:
@@ -119,7 +119,6 @@ def make_app(model: Octopi, name: str, *, token: str = "", places: int = 32, mos
         name: What clients call it.
         token: What they must send; empty for none, and then only names of this machine are answered to.
         places: Requests at once, from the first byte to the answer; the next gets 429.
-        most_bytes: Size of a request as sent, base64 included.
     """
     gate, worker = Gate(), Worker()
     taken = 0
@@ -130,6 +129,12 @@ def make_app(model: Octopi, name: str, *, token: str = "", places: int = 32, mos
         yield
         await asyncio.to_thread(worker.stop)
         gate.close()
+
+    async def refuse(_: Request, error: Exception) -> Response:
+        if isinstance(error, ClientDisconnect):
+            return Response(status_code=499)  # As nginx numbers it; nobody reads it.
+        content, status = _error(error)
+        return JSONResponse(content, status, getattr(error, "headers", None))
 
     async def check_token(request: Request) -> None:
         given = request.headers.get("authorization", "")
@@ -156,32 +161,31 @@ def make_app(model: Octopi, name: str, *, token: str = "", places: int = 32, mos
         finally:
             taken -= 1
 
-    def prepare(body: bytes, stack: ExitStack) -> tuple[ChatRequest, list[Exchange]]:
-        """The request and its conversation, whose videos are files until the stack is closed."""
-        wanted = read_request(body)
-        check_name(wanted.model)
-        said = read_conversation(wanted.messages)
-        files = iter(stack.enter_context(gate.files([video for _, videos, _ in said for video in videos])))
-        return wanted, [Exchange(q, tuple(next(files) for _ in videos), a) for q, videos, a in said]
-
-    def ask(wanted: ChatRequest, exchanges: list[Exchange], reply: Reply) -> Iterable[str]:
-        """The answer in pieces, made in the model's thread; its notes go into the reply."""
-        *history, last = exchanges
-        most = wanted.max_completion_tokens or wanted.max_tokens
-        most = min(most, MOST_TOKENS) if most else None
-        pieces = model.stream(last.question, last.videos, history=history, max_new_tokens=most)
-        notes = model.notes([video for exchange in exchanges for video in exchange.videos], last.question)
-        reply.notes = [PLACE.sub(r"video \1", note) for note in notes]
-        return pieces
-
-    app = FastAPI(title="octopi serve", lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
+    app = FastAPI(lifespan=lifespan, openapi_url=None)
+    for kind in (HTTPException, UserError, Failed, ClientDisconnect, Exception):
+        app.add_exception_handler(kind, refuse)
     guarded, place = [Depends(check_token)], Depends(take_place)
 
     @app.post("/v1/chat/completions", dependencies=guarded)
     async def chat(request: Request, stack: ExitStack = place) -> Response:
-        reply, body = Reply(name), await _read(request, most_bytes)
-        wanted, exchanges = await asyncio.to_thread(prepare, body, stack)
-        pieces = worker.answer(lambda: ask(wanted, exchanges, reply))
+        wanted = await asyncio.to_thread(read_request, await _read(request))
+        check_name(wanted.model)
+        said, reply = read_conversation(wanted.messages), Reply(name)
+        # The conversation's videos are files until the stack is closed.
+        checked = gate.files([video for _, videos, _ in said for video in videos])
+        paths = await asyncio.to_thread(stack.enter_context, checked)
+        files = iter(paths)
+        *history, last = [Exchange(q, tuple(next(files) for _ in videos), a) for q, videos, a in said]
+        most = wanted.max_completion_tokens or wanted.max_tokens
+
+        def ask() -> Iterable[str]:
+            """The answer in pieces, made in the model's thread; its notes go into the reply."""
+            tokens = min(most, MOST_TOKENS) if most else None
+            pieces = model.stream(last.question, last.videos, history=history, max_new_tokens=tokens)
+            reply.notes = [PLACE.sub(r"video \1", note) for note in model.notes(paths, last.question)]
+            return pieces
+
+        pieces = worker.answer(ask)
         if wanted.stream:
             # What fails before the first piece has a status of its own.
             first = await anext(pieces, "")
@@ -206,17 +210,5 @@ def make_app(model: Octopi, name: str, *, token: str = "", places: int = 32, mos
     @app.get("/health")
     async def health() -> Json:
         return {"status": "ok", "model": name, "waiting": taken, "places": places}
-
-    @app.exception_handler(ClientDisconnect)
-    async def left(_: Request, __: Exception) -> Response:
-        return Response(status_code=499)  # As nginx numbers it; nobody reads it.
-
-    @app.exception_handler(HTTPException)
-    @app.exception_handler(UserError)
-    @app.exception_handler(Failed)
-    @app.exception_handler(Exception)
-    async def refuse(_: Request, error: Exception) -> Response:
-        content, status = _error(error)
-        return JSONResponse(content, status, getattr(error, "headers", None))
 
     return app

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import ipaddress
-import itertools
 import logging
 import queue
 import socket
@@ -104,32 +103,27 @@ class Worker:
         """Answer what cannot be in a batch by itself, then the others in one."""
         batch: list[tuple[Job, Any]] = []
         for job in jobs:
-            if job.left:
-                continue
             try:
-                pieces = job.ask()
+                pieces = () if job.left else job.ask()
+                if hasattr(pieces, "together"):
+                    batch.append((job, pieces))
+                    continue
+                for piece in pieces:
+                    job.put(piece)
+                    if job.left:
+                        break
+                job.put(None)
             except Exception as error:
                 job.put(error)
-                continue
-            if hasattr(pieces, "together"):
-                batch.append((job, pieces))
-            else:
-                self._hand_out([job], ((0, piece) for piece in itertools.chain(pieces, [None])), set())
-        if batch:
-            left: set[int] = set()
-            together = batch[0][1].together([pieces for _, pieces in batch], left)
-            self._hand_out([job for job, _ in batch], together, left)
-
-    def _hand_out(self, jobs: Sequence[Job], pieces: Iterable[tuple[int, Any]], left: set[int]) -> None:
-        """Give jobs their pieces, each by the job's place; `left` gets the places of who left, or has all."""
+        left: set[int] = set()
         try:
-            for place, piece in pieces:
-                jobs[place].put(piece)
-                left.update(i for i, job in enumerate(jobs) if job.left)
-                if len(left) == len(jobs):
+            for place, piece in batch[0][1].together([pieces for _, pieces in batch], left) if batch else ():
+                batch[place][0].put(piece)
+                left.update(i for i, (job, _) in enumerate(batch) if job.left)
+                if len(left) == len(batch):
                     return
         except Exception as error:
-            for job in jobs:
+            for job, _ in batch:
                 job.put(error)
 
 

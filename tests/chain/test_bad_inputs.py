@@ -78,17 +78,14 @@ COMMANDS = {
     "scale smoke frames.per_vido=1": "frames.per_vido.*did you mean per_video",
     "scale smoke align.batch_size=10": "align.*does not divide",
     "scale smoke justaword": "key=value",
-    "scale smoke encoder.weights=nowhere": "hf download timm",
-    "scale smoke scenes.objects=[bath_towel,ice_block]": "no video of a training object",
     """scale smoke "split.name='Side ways'" """: "split.name.*Side ways.*pattern",
-    "stages/align.py nonsense all 0": "nonsense all 0.*python stages/align.py <encoder: finetuned, base",
-    "stages/lora.py finetuned all": "finetuned all'.*<opd: none, needed, all> <seed: 0, 1, ...>",
-    "stages/finetune_encoder.py -1": "-1.*python stages/",
+    "stages/align.py nonsense all 0": "'nonsense'; usage: stages/align.py {finetuned,base,words} {none",
+    "stages/lora.py finetuned all": "seed; usage: stages/lora.py",
+    "stages/finetune_encoder.py two": "'two'; usage: stages/finetune_encoder.py seed",
     **dict.fromkeys((f"stages/{stage}" for stage in STAGES), NOT_THERE),
     "weights gpt": "smollm2",
     "publish": "dvc.lock: no such file",
     "ask --model nothing": "nothing: .*|holds no",
-    "describe videos --csv t.csv --model nothing": "nothing: .*|holds no",
     "ask --model stages": "stages: holds no .*so it is no trained model",
     "ask --model nothing --device gpu": "allowed: auto, cpu, cuda, mps",
     "ask params.yaml": "is a file; write the question",
@@ -99,9 +96,8 @@ COMMANDS = {
     "page": "report",
 }
 PARAMS = {
-    "": "octopi scale smoke",
-    "scale: [": "not YAML",
-    "seed: 1\nseed: 2\n": "seed stands twice",
+    "": "empty; `octopi scale smoke",
+    "seed: 1\nseed: 2\n": ".*seed stands twice",
     b"\xff\xfes": "not UTF-8",
     None: "no such file",
 }
@@ -113,31 +109,26 @@ RUG = "rug: {modulus: 1, colour: red}"
 ROWS: list[tuple[str, str, Callable[[], object]]] = [
     *((command, words, bool) for command, words in COMMANDS.items()),
     *(
-        (command, f"params.yaml.*{words}|{words}.*params.yaml", partial(put, "params.yaml", text))
-        for command in ("publish", "repro", "stages/split.py")
+        ("stages/split.py", f"params.yaml: {words}", partial(put, "params.yaml", text))
         for text, words in PARAMS.items()
     ),
+    *((command, "params.yaml: not YAML", partial(put, "params.yaml", "scale: [")) for command in ("publish", "repro")),
     # What DVC writes.
     ("repro", "dvc.lock.*git checkout", partial(put, "dvc.lock", "stages: 3\n")),
-    ("repro", "dvc.lock.*git checkout", partial(put, "dvc.lock", b"\xff\xfe")),
-    ("publish", "dvc.lock: .*from Git", partial(put, "dvc.lock", "stages: {split: 3}\n")),
     ("publish", "dvc.lock: .*from Git", partial(put, "dvc.lock", b"\xff\xfe")),
     # What stages before them left.
     ("stages/split.py", "videos.parquet: not a readable table", partial(put, "data/videos.parquet", "?")),
     ("stages/questions.py", "0.parquet: not a readable table", partial(put, "data/splits/0.parquet", "?")),
     ("stages/grade.py", "line 1: not a Question", partial(put, "data/questions/0/evaluation.jsonl", "?\n")),
-    (MINE, "objects.csv.*missing", partial(catalogued, "objects.csv", "ball;a ball\n")),
     (MINE, "objects.csv.*line 2.*hardness.*0 to 2", partial(catalogued, "objects.csv", OBJECTS)),
     (MINE, "properties.yaml", partial(catalogued, "properties.yaml", b"\xff\xfe")),
     ("stages/synthesize.py", "colour: .*docs/scenes.md", partial(catalogued, "scenes.yaml", RUG)),
-    ("stages/synthesize.py", "correct it, or remove it", partial(catalogued, "scenes.yaml", b"rug: \xff\xfe")),
     (FRAMES, "rug.avi.*<object>_<number>.*rename.*videos.csv", partial(videos, "rug.avi", b"x")),
     (FRAMES, "videos/rug_0.avi", partial(videos, "rug_0.avi", b"not a video")),
     (FRAMES, "no video 'gone.mov' .*correct", partial(videos, "videos.csv", GONE)),
     ("data check videos", "rug_0.avi", partial(videos, "rug_0.avi", b"not a video")),
     ("data audit videos --split 'Not a name!'", "allowed: paper, release", partial(videos, "notes.txt", "")),
     (LLAMA, "model.safetensors", partial(spoilt, write_llama, "model.safetensors", 99)),
-    (LLAMA, "config.json", partial(spoilt, write_llama, "config.json", 1)),
     (LLAMA, "tokenizer.json", partial(spoilt, write_llama, "tokenizer.json", None)),
     (CLIP, "open_clip_model.safetensors", partial(spoilt, write_clip, "open_clip_model.safetensors", 99)),
 ]

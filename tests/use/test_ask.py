@@ -63,12 +63,7 @@ def test_a_question_may_be_longer_than_a_files_name(by_command: Command, octopi:
     assert octopi.doubts_about(question, 2) == octopi.doubts_about("Describe it.", 1) == octopi.doubts
 
 
-def test_a_chat_from_standard_input(by_command: Command, octopi: Octopi, files: list[Path]) -> None:
-    said = by_command("ask", typed=f"/add {files[0]}\n{QUESTION}\n/quit\n")
-    assert octopi.ask(QUESTION, files[:1]) in said.stdout
-
-
-def test_a_chat(octopi: Octopi, files: list[Path]) -> None:
+def test_a_chat(octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
     chat = Chat(octopi, said.append)
 
@@ -90,6 +85,9 @@ def test_a_chat(octopi: Octopi, files: list[Path]) -> None:
     assert type_("/reset", QUESTION.replace("{tactile}", "it")).startswith("a new conversation\n")
     assert "/quit" in type_("/unknown", "", "   ")
     assert type_("/quit", "/frames") == ""
+    monkeypatch.setattr(octopi, "stream", mock.Mock(side_effect=KeyboardInterrupt))
+    assert "stopped" in type_("Hello?")
+    assert not chat.history
 
 
 def test_a_chat_mixes_no_recordings_of_one_name(octopi: Octopi, files: list[Path], tmp_path: Path) -> None:
@@ -103,15 +101,6 @@ def test_a_chat_mixes_no_recordings_of_one_name(octopi: Octopi, files: list[Path
     changed = f"{touch} has changed since it was added; name the new one otherwise, or /reset"
     assert [line for line in "".join(said).split("\n") if "changed" in line] == [changed] * 2
     assert "".join(said).endswith(octopi.ask("{tactile} How soft is it?", files[1:2]) + "\n")
-
-
-def test_a_stopped_answer_is_forgotten(octopi: Octopi, monkeypatch: pytest.MonkeyPatch) -> None:
-    said: list[str] = []
-    chat = Chat(octopi, said.append)
-    monkeypatch.setattr(octopi, "stream", mock.Mock(side_effect=KeyboardInterrupt))
-    chat.run(["Hello?", "/reset"])
-    assert not chat.history
-    assert "stopped" in said[0]
 
 
 @pytest.fixture
@@ -166,12 +155,11 @@ def test_described_by_command(by_command: Command, folder: Path, files: list[Pat
     by_command("describe", files[0], "--csv", alone)
     assert [row["file"] for row in rows_of(alone)] == [files[0].name]
     (broken := tmp_path / "broken.avi").touch()
-    for given in ([broken], [broken, broken, "--csv", tmp_path / "broken.csv"]):
-        by_command("describe", *given, status=1)
+    by_command("describe", broken, status=1)
 
 
 def test_described_compared_ranked_and_matched_by_command(
-    by_command: Command, octopi: Octopi, files: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    by_command: Command, octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each as the call of the same name, and what makes one doubt it on stderr, once."""
     monkeypatch.setattr(octopi, "doubts", ("no answer means anything",))
@@ -183,10 +171,6 @@ def test_described_compared_ranked_and_matched_by_command(
 
     one, two, three = map(str, files)
     known, table = octopi.describe(one), said("describe", one)
-    long = shutil.copy(one, tmp_path / f"{'long_' * 20}name.avi")
-    assert (
-        "".join(line[1:].split("│")[0].strip() for line in said("describe", long).splitlines()[3:-1]) == Path(long).name
-    )
     shares = (f"({max(found.values()):.0%})" for found in known.probabilities.values())
     assert all(word in table for word in (files[0].name, *known.levels, *known.levels.values(), *shares))
     assert said("compare", one, two, "hardness") == octopi.compare(one, two, "hardness").answer + "\n"
@@ -195,8 +179,6 @@ def test_described_compared_ranked_and_matched_by_command(
     assert [line.split("  ")[1] for line in lines] == [[three, one, two][i] for i in ranked.order]
     assert answer == ranked.answer
     assert scale.endswith("0 smooth, 1 slightly rough, 2 rough")
-    folder = said("rank", "roughness", files[0].parent).splitlines()[1:]
-    assert {Path(line.split("  ")[1]) for line in folder} == set(files[0].parent.iterdir())
     own = {"mug": ["hard", "smooth", "no bumps"], "rug": ["soft", "rough", "no bumps"]}
     typed = "mug: hard, smooth, no bumps; rug: soft, rough, no bumps"
     for named, given in (("rug, millet", ["rug", "millet"]), (typed, own)):
@@ -236,11 +218,7 @@ def test_a_row_never_stands_for_another_recording(octopi: Octopi, files: list[Pa
     assert describe_folder(octopi, [one.parent], out) == (1, 0)
 
 
-@pytest.mark.parametrize(
-    "content",
-    [b"", b"my only notes", b"file,object\n", "file;größe\n".encode("utf-16")],
-    ids=["another training's", "notes", "begun alike", "utf-16"],
-)
+@pytest.mark.parametrize("content", [b"", b"file,object\n"], ids=["another training's", "begun alike"])
 def test_what_another_model_or_somebody_else_wrote_stays(
     content: bytes, octopi: Octopi, files: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

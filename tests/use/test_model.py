@@ -155,10 +155,9 @@ def test_typed_tasks(octopi: Octopi, files: list[Path], monkeypatch: pytest.Monk
     assert matched.names == (names[0], names[2], names[1])
     assert all(name in matched.question for name in names)
     said["match"] = f"Conclusion: a) is {names[0]} and b) is {names[2]}."
-    for named in ([names[0], names[2]], ["rug", "millet"], ["rug", names[2].upper()]):
-        two = octopi.match(files[:2], named)
-        assert (two.names, two.question.count("{tactile}")) == ((names[0], names[2]), 2)
-        assert "it was trained to match three videos, not two" in two.notes
+    two = octopi.match(files[:2], ["rug", names[2].upper()])
+    assert (two.names, two.question.count("{tactile}")) == ((names[0], names[2]), 2)
+    assert "it was trained to match three videos, not two" in two.notes
     # Objects of the caller's own, told in the heads' own words of each video: the heads must find them again.
     told = {f"thing {n}": tuple(octopi.describe(f, sentence=False).levels.values()) for n, f in enumerate(files)}
     said["match"] = "Conclusion: a) is thing 1, b) is thing 0 and c) is thing 2."
@@ -174,24 +173,13 @@ def test_typed_tasks(octopi: Octopi, files: list[Path], monkeypatch: pytest.Monk
     chosen = octopi.scenario("I must sleep.", files[:2])
     assert chosen.choice == 1
     assert [call.args[0].count("{tactile}") for call in ask.mock_calls[-2:]] == [2, 0], "described first"
-    for record in (compared, ranked, numbered, chosen):
-        assert record.model_validate_json(record.model_dump_json()) == record
-
-
-def test_tasks_ask_in_the_wording_of_training(made: Made, octopi: Octopi, files: list[Path]) -> None:
-    asked = [t.user for q in made.questions for d in q.dialogues if d.opd is Opd.ALL for t in d.turns]
-    known = next(p for p in octopi.catalogue.properties if any(p.more in user for user in asked))
-    question = octopi.compare(files[0], files[1], known.name).question
-    assert any(question.split("than")[1] in user for user in asked if known.more in user)
 
 
 @pytest.mark.parametrize(
     ("question", "count", "words"),
     [
         ("{tactile} is it softer?", 2, r"1 \{tactile\} for 2 videos"),
-        ("{tactile} {tactile}", 1, r"2 \{tactile\} for 1 video;"),
         ("Describe what you feel.", 0, "without a video, so any touch would be made up"),
-        ("{tactile}?", 0, r"1 \{tactile\} for 0 videos"),
         ("  ", 0, "question is empty"),
         ("Is it \udcff?", 0, "is no text in UTF-8"),
         ("Is <tact_frame> soft?", 0, "<tact_frame>, which stands for a touch"),
@@ -213,24 +201,21 @@ def test_videos_that_cannot_be_used_are_refused(octopi: Octopi, tmp_path: Path, 
     (tmp_path / "cut.avi").write_bytes(whole[: len(whole) // 20])
     one = write_video(tmp_path / "one.avi", moving_square(1))
     still = write_video(tmp_path / "still.avi", [np.full((36, 48, 3), 90, np.uint8)] * 12)
-    shapes = ((32, 32, 3), (4, 3, 32, 32), (0, 32, 32, 3))
-    arrays = [np.zeros(shape, np.uint8) for shape in shapes] + [np.zeros((4, 32, 32, 3), np.float32)]
+    arrays = [np.zeros((4, 3, 32, 32), np.uint8), np.zeros((0, 32, 32, 3), np.uint8), np.zeros((4, 32, 32, 3))]
     bad: list[tuple[Any, str]] = [
-        *((path, "no such file") for path in (tmp_path / "nothing.avi", tmp_path)),
+        (tmp_path, "no such file"),
         (tmp_path / "empty.avi", "empty"),
         (tmp_path / "text.avi", "no frame decodes"),
         (tmp_path / "cut.avi", "no frame decodes|show no touch"),
         (one, "show no touch"),
         (still, "nothing touches the sensor"),
-        *((nothing, "is no video; give a file") for nothing in (None, 3, [files[0]])),
+        (None, "is no video; give a file"),
         *((array, "is no video; give uint8") for array in arrays),
     ]
     for video, words in bad:
         name = f"^{re.escape(str(video))}" if isinstance(video, Path) else "^an? "
         with refused(f"{name}.*({words})"):
             octopi.ask("Describe {tactile}.", [video])
-        with refused(words):
-            octopi.rank([*files, video], "hardness")
     assert any("nothing touches the sensor" in note for note in octopi.describe(still).notes)
 
 
@@ -239,17 +224,12 @@ def test_unknown_words_are_refused(octopi: Octopi, files: list[Path]) -> None:
         octopi.compare(files[0], files[1], "hardnes")
     with refused("a unicorn: .*catalogue has no such object; .*NAME: soft"):
         octopi.match(files, ["rug", "millet", "a unicorn"])
-    for classes in (("hard", "smooth"), ("hard", "smooth", "bumpy"), ()):
-        with refused(r"NAME: soft\|moderately hard\|hard, .*no bumps"):
-            octopi.match(files, {"a mug": classes, "a rug": ("soft", "rough", "no bumps"), "it": ("soft",) * 3})
+    with refused(r"NAME: soft\|moderately hard\|hard, .*no bumps"):
+        octopi.match(files[:2], {"a mug": ("hard", "smooth", "bumpy"), "a rug": ("soft", "rough", "no bumps")})
     with refused("two or three of each"):
         octopi.match(files[:2], ["rug", "millet", "candle"])
     with refused("a name is given twice"):
         octopi.match(files, ["rug", octopi.catalogue.objects["rug"].name, "millet"])
-    with refused("1 video: two or more can be ranked"):
-        octopi.rank(files[:1], "hardness")
-    with refused("chooses between two"):
-        octopi.scenario("I must sleep.", files)
 
 
 def test_a_changed_file_is_read_anew(octopi: Octopi, tmp_path: Path) -> None:
@@ -314,8 +294,6 @@ def test_what_is_no_memory_is_refused_and_stays(octopi: Octopi, files: list[Path
     memory = tmp_path / "touches"
     with refused("no memory of touches; `octopi remember"):
         octopi.recognise(files[0], memory)
-    with refused("name is empty"):
-        octopi.remember(" ", files[0], memory)
     octopi.remember("my ice", files[0], memory)
     written = (memory / TOUCHES).read_text()
     still = np.full((20, 64, 64, 3), 90, np.uint8)

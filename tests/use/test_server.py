@@ -85,8 +85,9 @@ def test_no_answer_of_many_clients_is_lost_or_mixed_up() -> None:
     assert len(fake.threads) == 1
 
 
-def test_a_refused_body_is_read_so_that_the_answer_is_seen() -> None:
-    with serving(FakeOctopi(), most_bytes=100_000) as address:
+def test_a_refused_body_is_read_so_that_the_answer_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.use.serve.MOST_BYTES", 100_000)
+    with serving(FakeOctopi()) as address:
         assert ask(address, b"x" * 300_000).status_code == 413
         assert ask(address, body(user("hello"))).status_code == 200
 
