@@ -122,16 +122,11 @@ def _variants(
     scores, new, links = accuracies(params), 0, dict[str, str]()
     store.kill({KIND: "variant"})
     for variant in params.ablation.variants():
-        stage = stages.get(f"answer@{variant.key}")
-        if stage is None:
+        if (stage := stages.get(f"answer@{variant.key}")) is None:
             continue
-        trained, metrics = f"{variant.encoder}-{variant.opd}-{variant.seed}", scores.get(variant.key, {})
-        made = {"predictions": DATA / "answers" / variant.key, "model": DATA / "models" / variant.lora / trained}
-        made["alignment"] = DATA / "models" / Lora.WITHOUT / trained
-        made["encoder"] = DATA / "encoder" / str(variant.seed)
-        made["package"] = Path("models") / variant.key
+        metrics, package = scores.get(variant.key, {}), Path("models") / variant.key
         # A folder that is packaged is whole when it has its card.
-        card = made["package"] / "config.json"
+        card = package / "config.json"
         content = digest([metrics, stage.outs, *([card.read_text(encoding="utf-8")] if card.is_file() else [])])
         if old := store.find({VARIANT: variant.key, CONTENT: content}):
             if old[0].data.tags.get(PARENT) != parent:
@@ -144,9 +139,14 @@ def _variants(
         # Whole tasks before their parts, as the dashboard keeps the order.
         ordered = sorted(metrics.items(), key=lambda metric: ("." in metric[0], metric[0]))
         store.log(run, [(name, value, end, 0) for name, value in ordered])
-        unused = {"alignment": variant.lora is Lora.WITHOUT, "encoder": variant.encoder is not Encoder.FINETUNED}
-        for place, path in made.items():
-            if path.is_dir() and not unused.get(place):
+        models, trained = DATA / "models", f"{variant.encoder}-{variant.opd}-{variant.seed}"
+        made = {"predictions": DATA / "answers" / variant.key, "model": models / variant.lora / trained}
+        if variant.lora is not Lora.WITHOUT:
+            made["alignment"] = models / Lora.WITHOUT / trained
+        if variant.encoder is Encoder.FINETUNED:
+            made["encoder"] = DATA / "encoder" / str(variant.seed)
+        for place, path in {**made, "package": package}.items():
+            if path.is_dir():
                 store.client.log_artifacts(run, str(path), place)
         store.finish(run, end, {CONTENT: content})
         new += 1
