@@ -15,12 +15,10 @@ import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 from pydantic import Field
 
 from pipeline.config import Params
@@ -32,14 +30,13 @@ from pipeline.evaluation.records import Shown, VisionModel
 from pipeline.running.errors import UserError
 from pipeline.running.progress import track
 from pipeline.running.stage import alone
+from pipeline.tasks import TASKS
 from pipeline.training.sampling import sample_evaluation
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.frames.store import FrameStore, frames_key
 
 Show = Callable[[str], list[dict[str, Any]]]
 """From a video's id to the pictures that stand for it, as parts of a message."""
-Said = tuple[tuple[str, ...], list["Reply"]]
-"""A prediction's outputs, and the replies that they are made of."""
 
 PHOTO_SUFFIXES = (".jpeg", ".jpg", ".png", ".webp")
 EXAMPLES = 3
@@ -60,6 +57,10 @@ PUBLISHED = {
 }
 """How the paper asks PG-InstructBLIP, which never said "moderately hard" or "slightly rough": what it chooses from, and
 the class of each (its appendix on PG-InstructBLIP's property prediction)."""
+PROMPTS = [
+    f"{{tactile}}Classify the object as {choices}? Respond unknown if you are not sure. Short answer:"
+    for choices, _ in PUBLISHED.values()
+]
 
 
 class Reply(Record):
@@ -85,16 +86,13 @@ def ask_all(
     have run up to its questions (and frames, where they are shown). Returns a line that says what was done.
 
     Args:
-        params: Whose questions, seeds and frames.
         url: Of the endpoint, up to and with the `/v1` that most have.
         settings: What a request has beside its messages: `model`, `temperature` and `max_completion_tokens`.
-        folder: Folder of the kept frames, or of the photos: for each object `<object>.jpg` or a folder `<object>/`.
-        published: Only describe, by the paper's three prompts, from one photo a video where photos are shown; the
-            folder's name then ends with -published.
+        folder: Of the kept frames, or of the photos: for each object `<object>.jpg` or a folder `<object>/`.
+        published: Only describe, by the paper's three prompts, from one photo a video where photos are shown.
 
     Raises:
-        UserError: where the catalogue has other properties than the published prompts, an input is missing, or the
-            endpoint fails.
+        UserError: where the prompts are about other properties, an input is missing, or the endpoint fails.
     """
     if re.search("[@?]", url):
         raise UserError("--endpoint: the URL is written beside the answers; put a key into OPENAI_API_KEY instead")
@@ -106,28 +104,33 @@ def ask_all(
         raise UserError(f"--prompt published: is about {', '.join(PUBLISHED)} alone, of three classes; leave it out")
     with alone(f"answer-with@{name}"):
         every = [(s, q) for s, f in files.items() for q in read_jsonl(f, Question) if q.task == "OPD" or not published]
-        training = {seed: read_jsonl(questions_file(seed, "train"), Question) for seed in files}
         most = 1 if published and shown is Shown.PHOTOS else params.frames.per_video
         show = _frames(folder, most) if shown is Shown.FRAMES else _photos(folder, [q for _, q in every], most)
+        training = {seed: read_jsonl(questions_file(seed, "train"), Question) for seed in files}
+        told = {(s, t): instruction(catalogue, shown, training[s], t) for s in files for t in TASKS}
         asker = _Asker(url, settings, place / "cache.jsonl")
         answers: dict[int, list[Prediction]] = {seed: [] for seed in files}
+        used: dict[str, Reply] = {}
         for seed, question in track(every, name, "question"):
             if published:
-                outputs, replies = _classify(question, catalogue, asker, show)
+                replies = [r for prompt in PROMPTS for r in _converse([prompt], question.videos, asker, show)]
+                outputs = [_description(replies, catalogue)]
             else:
-                told = instruction(catalogue, shown, choose_examples(training[seed], question.task))
-                outputs, replies = _answer(question, told, asker, show)
+                # As the full system is asked; every task has this mode.
+                (turns,) = ([turn.user for turn in d.turns] for d in question.dialogues if d.opd is Opd.ALL)
+                replies = _converse([told[seed, question.task] + turns[0], *turns[1:]], question.videos, asker, show)
+                outputs = [r.text for r in replies] + [""] * (len(turns) - len(replies))
+            used |= {reply.request: reply for reply in replies}
             cut, tokens = any(r.ended == "length" for r in replies), sum(r.tokens for r in replies)
             whose = {"question_id": question.question_id, "task": question.task}
-            answers[seed].append(Prediction(**whose, outputs=outputs, truncated=cut, tokens=tokens))
+            answers[seed].append(Prediction(**whose, outputs=tuple(outputs), truncated=cut, tokens=tokens))
         for seed, predictions in answers.items():
             write_jsonl(place / f"{seed}.jsonl", predictions)
-        # Written last, since this file vouches that the answers beside it belong to these questions.
-        used = asker.used.values()
-        days, ended = sorted(reply.day for reply in used) or [""], Counter(sorted(reply.ended for reply in used))
+        days = sorted(reply.day for reply in used.values()) or [""]
+        ended = Counter(sorted(reply.ended for reply in used.values()))
         source = VisionModel(
             model=settings["model"] + (", published prompts" if published else ""),
-            served_as=tuple(sorted({reply.model for reply in used})),
+            served_as=tuple(sorted({reply.model for reply in used.values()})),
             endpoint=url,
             temperature=settings["temperature"],
             max_tokens=settings["max_completion_tokens"],
@@ -141,28 +144,26 @@ def ask_all(
             folder=str(folder),
             frames=frames_key(folder) if shown is Shown.FRAMES else "",
         )
+        # Written last, since this file vouches that the answers beside it belong to these questions.
         write_json(place / SOURCE_FILE, source.model_dump(mode="json"))
-    how = ", ".join(f"{count} {kind}" for kind, count in ended.items())
-    return f"{place}: {len(every)} questions answered by {asker.sent} requests ({how}); `dvc repro` grades them"
+    how, sent = ", ".join(f"{count} {kind}" for kind, count in ended.items()), len(asker.known) - asker.before
+    return f"{place}: {len(every)} questions answered by {sent} requests ({how}); `dvc repro` grades them"
 
 
-def choose_examples(training: Sequence[Question], task: str) -> list[Question]:
-    """The first `EXAMPLES` training questions of a task whose right choices differ, so that they show each kind."""
-    first: dict[str, Question] = {}
-    for question in training:
-        if question.task == task:
-            first.setdefault(question.gold.choice, question)
-    return list(first.values())[:EXAMPLES]
-
-
-def instruction(catalogue: Catalogue, shown: Shown, examples: Sequence[Question]) -> str:
+def instruction(catalogue: Catalogue, shown: Shown, training: Sequence[Question], task: str) -> str:
     """What stands before a question: what is seen, the properties with their classes, and how an answer is worded.
 
-    Examples are training questions of the task, told in words; there are none where it is never trained.
+    Examples are the first training questions of the task whose right choices differ, told in words; there are none
+    where it is never trained.
     """
+    first: dict[str, Question] = {}
+    for q in training:
+        if q.task == task:
+            first.setdefault(q.gold.choice, q)
+    examples = list(first.values())[:EXAMPLES]
+    turns = [turn for q in examples for d in q.dialogues if d.opd is Opd.ALL for turn in d.turns]
     classes = "; ".join(f"{p.spoken} ({', '.join(p.levels)})" for p in catalogue.properties)
     form = catalogue.language.structured.format(**{p.name: f"<{p.spoken}>" for p in catalogue.properties})
-    turns = [turn for q in examples for d in q.dialogues if d.opd is Opd.ALL for turn in d.turns]
     lines = [
         KINDS[shown],
         f"Objects have these properties, each in one of the classes in brackets: {classes}.",
@@ -175,41 +176,32 @@ def instruction(catalogue: Catalogue, shown: Shown, examples: Sequence[Question]
     return "\n".join(lines).replace("{tactile}", "[pictures]") + "\n\n"
 
 
-def _answer(question: Question, told: str, asker: _Asker, show: Show) -> Said:
-    """Ask all turns of a question, as the full system is asked."""
-    dialogue = question.dialogue(Opd.ALL)
-    assert dialogue is not None, "every task has this mode"
+def _converse(turns: Sequence[str], videos: Sequence[str], asker: _Asker, show: Show) -> list[Reply]:
+    """Ask turn after turn, with pictures where a text has `{tactile}`; nothing follows a reply without text."""
     messages: list[dict[str, Any]] = []
     replies: list[Reply] = []
-    touched = iter(question.videos)
-    for turn in dialogue.turns:
-        first, *others = (turn.user if messages else told + turn.user).split("{tactile}")
-        content: list[dict[str, Any]] = [{"type": "text", "text": first}]
-        for text in others:
-            content += [*show(next(touched)), *([{"type": "text", "text": text}] if text else [])]
+    touched = iter(videos)
+    for turn in turns:
+        content: list[dict[str, Any]] = []
+        for place, text in enumerate(turn.split("{tactile}")):
+            content += show(next(touched)) if place else []
+            content += [{"type": "text", "text": text}] if text else []
         messages.append({"role": "user", "content": content})
         replies.append(asker.ask(messages))
         if not replies[-1].text:
-            # Endpoints take no empty turn, and nothing can follow from one.
             break
         messages.append({"role": "assistant", "content": replies[-1].text})
-    unsaid = len(dialogue.turns) - len(replies)
-    return (*(r.text for r in replies), *[""] * unsaid), replies
+    return replies
 
 
-def _classify(question: Question, catalogue: Catalogue, asker: _Asker, show: Show) -> Said:
-    """Ask the published prompts about one object, and word the replies as a description; other replies stay unknown."""
-    told: dict[str, str] = {}
-    replies: list[Reply] = []
-    for prop in catalogue.properties:
-        choices, classes = PUBLISHED[prop.name]
-        prompt = f"Classify the object as {choices}? Respond unknown if you are not sure. Short answer:"
-        content = [*show(*question.videos), {"type": "text", "text": prompt}]
-        replies.append(asker.ask([{"role": "user", "content": content}]))
-        # One that names two classes has chosen none.
-        named = [level for words, level in classes.items() if re.search(rf"\b{words}\b", replies[-1].text.lower())]
+def _description(replies: Sequence[Reply], catalogue: Catalogue) -> str:
+    """The classes that replies to `PROMPTS` name, as a description; who names none or two has chosen none."""
+    told = {}
+    for prop, reply in zip(catalogue.properties, replies, strict=True):
+        classes = PUBLISHED[prop.name][1].items()
+        named = [level for words, level in classes if re.search(rf"\b{words}\b", reply.text.lower())]
         told[prop.name] = prop.levels[named[0]] if len(named) == 1 else "unknown"
-    return (catalogue.language.structured.format(**told),), replies
+    return catalogue.language.structured.format(**told)
 
 
 class _Asker:
@@ -218,33 +210,29 @@ class _Asker:
     def __init__(self, url: str, settings: Mapping[str, Any], cache: Path) -> None:
         import openai
 
-        self.url, self.settings, self.cache, self.sent = url, settings, cache, 0
+        self.url, self.settings, self.cache = url, settings, cache
         # A server of one's own wants no key, but the client does.
         self.client = openai.OpenAI(base_url=url, api_key=os.environ.get("OPENAI_API_KEY", "").strip() or "none")
-        self.used: dict[str, Reply] = {}
-        self.known: dict[str, Reply] = {}
-        if cache.is_file():
-            content = cache.read_bytes()
+        cache.parent.mkdir(parents=True, exist_ok=True)
+        content = cache.read_bytes() if cache.is_file() else b""
+        if not content.endswith(b"\n"):
             # Half a line, of a run that was killed while it wrote, is asked for again.
-            if not content.endswith(b"\n"):
-                cache.write_bytes(content[: content.rfind(b"\n") + 1])
-            self.known = {reply.request: reply for reply in read_jsonl(cache, Reply)}
+            cache.write_bytes(content[: content.rfind(b"\n") + 1])
+        self.known = {reply.request: reply for reply in read_jsonl(cache, Reply)}
+        self.before = len(self.known)
 
     def ask(self, messages: Sequence[dict[str, Any]]) -> Reply:
         """The reply to a conversation; UserError where the endpoint fails."""
         body = {**self.settings, "messages": list(messages)}
         request = hashlib.sha256(json.dumps([self.url, body], sort_keys=True).encode()).hexdigest()
         if request not in self.known:
-            self.known[request] = self._send(request, body)
-            self.sent += 1
-            self.cache.parent.mkdir(parents=True, exist_ok=True)
+            self.known[request] = Reply(request=request, **self._send(body))
             with self.cache.open("a", encoding="utf-8") as stream:
                 stream.write(self.known[request].model_dump_json() + "\n")
-        self.used[request] = self.known[request]
-        return self.used[request]
+        return self.known[request]
 
-    def _send(self, request: str, body: dict[str, Any]) -> Reply:
-        """What the endpoint says; a refusal to answer this question is a reply, too."""
+    def _send(self, body: dict[str, Any]) -> dict[str, Any]:
+        """What the endpoint says, as fields of a `Reply`; a refusal to answer this question is a reply, too."""
         import openai
 
         try:
@@ -256,13 +244,13 @@ class _Asker:
             tokens = completion.usage.completion_tokens if completion.usage else 0
         except (openai.OpenAIError, ValueError, TypeError, AttributeError, IndexError) as error:
             if getattr(error, "status_code", 0) == 400 and getattr(error, "code", "") in FILTERS:
-                return Reply(request=request, ended=FILTERS[0])
+                return {"ended": FILTERS[0]}
             failed = isinstance(error, openai.OpenAIError | ValueError)
             why = str(error.__cause__ or error) if failed else f"no chat completion ({completion}); is the URL right?"
             why = " ".join(why.split()).replace(self.client.api_key, "[key]")[:300]
             raise UserError(f"{self.url}: {why}; what it said before is kept, run it again to go on") from None
         ended = "nothing" if ended == "stop" and not text else ended
-        return Reply(request=request, text=text, ended=ended, tokens=tokens, model=completion.model or "")
+        return {"text": text, "ended": ended, "tokens": tokens, "model": completion.model or ""}
 
 
 def _frames(folder: Path, most: int) -> Show:
@@ -280,12 +268,13 @@ def _frames(folder: Path, most: int) -> Show:
 
 
 def _photos(folder: Path, questions: Sequence[Question], most: int) -> Show:
-    """Photos of the object that was touched in a video; with `most` 1, each of its videos gets the next one."""
+    """Photos of the object that was touched in a video, with no camera's metadata; with `most` 1, each of its videos
+    gets the next one."""
     touched = {v: o for q in questions for v, o in zip(q.videos, q.objects, strict=True)}
     found: dict[str, list[Path]] = {}
     for name in sorted({*touched.values()}):
         # Those named after it, and those in the folder of its name.
-        files = chain(folder.glob(f"{name}.*"), (folder / name).glob("[!.]*"))
+        files = [*folder.glob(f"{name}.*"), *(folder / name).glob("[!.]*")]
         found[name] = sorted(f for f in files if f.suffix.lower() in PHOTO_SUFFIXES)
         if not found[name]:
             kinds = ", ".join(PHOTO_SUFFIXES)
@@ -294,23 +283,20 @@ def _photos(folder: Path, questions: Sequence[Question], most: int) -> Show:
     def show(video_id: str) -> list[dict[str, Any]]:
         files, own = found[touched[video_id]], sorted(v for v, o in touched.items() if o == touched[video_id])
         places = sorted({*sample_evaluation(len(files), most)}) if most > 1 else [own.index(video_id) % len(files)]
-        return [_photo(files[i]) for i in places]
+        pictures = []
+        for file in (files[i] for i in places):
+            if (photo := cv2.imread(str(file))) is None:  # Upright, as its camera was held.
+                raise UserError(f"{file}: not a picture that can be read; replace it")
+            scale = min(1.0, LONGEST / max(photo.shape[:2]))
+            small = cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+            pictures.append(_picture(small, "jpeg"))
+        return pictures
 
     return show
 
 
-def _photo(file: Path) -> dict[str, Any]:
-    """A photo as its camera was held, no larger than need be; encoded anew, so that no EXIF data leaves."""
-    data = np.fromfile(file, np.uint8)
-    photo = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-    if photo is None:
-        raise UserError(f"{file}: not a picture that can be read; replace it")
-    scale = min(1.0, LONGEST / max(photo.shape[:2]))
-    return _picture(cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), "jpeg")
-
-
 def _picture(picture: cv2.typing.MatLike, kind: str) -> dict[str, Any]:
-    """A picture of rows x columns x BGR as a part of a message."""
+    """A picture of rows x columns x BGR as a part of a message; encoded anew, it has no metadata."""
     _, data = cv2.imencode(f".{kind}", picture)
     url = f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode()}"
     return {"type": "image_url", "image_url": {"url": url}}

@@ -10,7 +10,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from statistics import fmean
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from statsmodels.stats.multitest import multipletests
@@ -60,16 +60,11 @@ class Answer(NamedTuple):
     parsed: bool = True
     strict: bool | None = None
 
-    @classmethod
-    def of(cls, score: Score) -> Answer:
-        """From a graded measure."""
-        return cls(score.correct, score.objects, score.parsed, score.strict)
-
 
 Runs = Mapping[int, Mapping[str, Answer]]
 """By seed and question."""
-Entry = tuple[str, str, Setting, int, str, Answer]
-"""Task, measure, setting, seed, question and its answer."""
+Entry = tuple[Score, Setting, int]
+"""A score, who answered, and the seed."""
 Table = Mapping[tuple[str, str], Mapping[Setting, Runs]]
 """By task and measure, then setting, seed and question."""
 
@@ -89,10 +84,7 @@ def score_rows(
         vision: Graded answers of vision-only models.
         concluded: By seed, the scores that `pipeline.evaluation.grading.conclude` gives.
     """
-    seen = _tabled(
-        (g.task, g.measure, Setting(g.model, opd=Opd.ALL, touch=g.shown), g.seed, g.question_id, Answer.of(g))
-        for g in vision
-    )
+    seen = _tabled((g, Setting(g.model, opd=Opd.ALL, touch=g.shown), g.seed) for g in vision)
     chances, rows = {name: task.chance(catalogue) for name, task in TASKS.items()}, []
     for table in (_answers(graded, catalogue, concluded or {}), seen, _heads(classifications or {}, catalogue)):
         for (task, measure), settings in table.items():
@@ -140,34 +132,33 @@ def difference(one: Runs, other: Runs) -> Difference | None:
     return paired(np.array(gains), [one[seeds[0]][q].objects for q in asked])
 
 
-def _rows(runs: Runs, **named: object) -> list[ScoreRow]:
+def _rows(runs: Runs, *, chance: float, **named: str) -> list[ScoreRow]:
     """A row a seed, and the last over all seeds, on the questions that all of them have answered."""
-    asked = _shared(runs.values())
-    found = [_row([[a] for a in answers.values()], seed=str(seed), **named) for seed, answers in sorted(runs.items())]
-    if asked:
-        found.append(_row([[answers[q] for answers in runs.values()] for q in asked], seed=ALL_SEEDS, **named))
-    return found
-
-
-def _row(questions: Sequence[Sequence[Answer]], **named: object) -> ScoreRow:
-    """One accuracy from the answers to each question, one a seed."""
-    right = [fmean(a.correct for a in answers) for answers in questions]
-    compared = [a.strict for answers in questions for a in answers]
-    about = [answers[0].objects for answers in questions]
-    interval = accuracy_interval(np.array(right), about)
-    return ScoreRow.model_validate(
-        {
-            **{name: str(value) if name != "chance" else value for name, value in named.items()},
-            "n": len(right),
-            "sets": len(set(map(frozenset, about))),
-            "right": sum(right),
-            "unread": sum(fmean(not a.parsed for a in answers) for answers in questions),
-            "accuracy": fmean(right),
-            "low": interval and interval.low,
-            "high": interval and interval.high,
-            "strict": None if None in compared else fmean(map(bool, compared)),
-        }
-    )
+    # By seed, the answers to each question.
+    given = {str(seed): [[a] for a in answers.values()] for seed, answers in sorted(runs.items())}
+    if asked := _shared(runs.values()):
+        given[ALL_SEEDS] = [[answers[q] for answers in runs.values()] for q in asked]
+    rows = []
+    for seed, questions in given.items():
+        right = [fmean(a.correct for a in answers) for answers in questions]
+        compared = [a.strict for answers in questions for a in answers]
+        about = [answers[0].objects for answers in questions]
+        interval = accuracy_interval(np.array(right), about)
+        row = ScoreRow(
+            **{name: str(value) for name, value in named.items()},
+            seed=seed,
+            n=len(right),
+            sets=len(set(map(frozenset, about))),
+            right=sum(right),
+            unread=sum(fmean(not a.parsed for a in answers) for answers in questions),
+            accuracy=fmean(right),
+            low=interval and interval.low,
+            high=interval and interval.high,
+            chance=chance,
+            strict=None if None in compared else fmean(map(bool, compared)),
+        )
+        rows.append(row)
+    return rows
 
 
 def grouped(graded: Iterable[Graded]) -> Table:
@@ -176,8 +167,7 @@ def grouped(graded: Iterable[Graded]) -> Table:
 
 
 def _entries(graded: Iterable[Graded]) -> Iterator[Entry]:
-    for g in graded:
-        yield g.task, g.measure, Setting(g.encoder, g.lora, g.opd, g.touch), g.seed, g.question_id, Answer.of(g)
+    return ((g, Setting(g.encoder, g.lora, g.opd, g.touch), g.seed) for g in graded)
 
 
 def _tabled(entries: Iterable[Entry], order: Iterable[tuple[str, str]] = ()) -> Table:
@@ -185,18 +175,14 @@ def _tabled(entries: Iterable[Entry], order: Iterable[tuple[str, str]] = ()) -> 
     found: dict[tuple[str, str], dict[Setting, dict[int, dict[str, Answer]]]] = defaultdict(
         lambda: defaultdict(lambda: defaultdict(dict))
     )
-    for task, measure, setting, seed, question, answer in entries:
-        found[task, measure][setting][seed][question] = answer
+    for s, setting, seed in entries:
+        found[s.task, s.measure][setting][seed][s.question_id] = Answer(s.correct, s.objects, s.parsed, s.strict)
     return {key: found[key] for key in order or found if key in found}
 
 
 def _answers(graded: Iterable[Graded], catalogue: Catalogue, concluded: Mapping[int, Sequence[Score]]) -> Table:
     """In the order of the registered tasks and of what each calls its measures."""
-    ruled = (
-        (s.task, s.measure, RULES, seed, s.question_id, Answer.of(s))
-        for seed, scores in concluded.items()
-        for s in scores
-    )
+    ruled = ((score, RULES, seed) for seed, scores in concluded.items() for score in scores)
     order = [(task, measure) for task, definition in TASKS.items() for measure in definition.chance(catalogue)]
     return _tabled(chain(_entries(graded), ruled), order)
 
@@ -205,16 +191,21 @@ def _heads(classifications: Mapping[int, Sequence[Classification]], catalogue: C
     """The heads' test videos, validation videos, and test videos by class: each property, and `combined`, all of a
     video's."""
     kinds, entries = {Part.TEST: HEADS, Part.VALIDATION: VALIDATION_HEADS}, list[Entry]()
-    whole: dict[tuple[str, int, str], Answer] = {}
     levels = {p.name: p.levels for p in catalogue.properties}
-    for seed, c in ((seed, c) for seed, records in classifications.items() for c in records if c.part in kinds):
-        answer, kind = Answer(c.expected == c.predicted, (c.object_id,)), kinds[c.part]
-        entries.append((kind, c.property, RULES, seed, c.video_id, answer))
-        if c.part is Part.TEST:
-            entries.append((RECALL, f"{c.property}: {levels[c.property][c.expected]}", RULES, seed, c.video_id, answer))
-        before = whole.get((kind, seed, c.video_id), answer)
-        whole[kind, seed, c.video_id] = answer._replace(correct=answer.correct and before.correct)
-    entries += [(kind, "combined", RULES, seed, video, answer) for (kind, seed, video), answer in whole.items()]
+    for seed, records in classifications.items():
+        videos: dict[tuple[str, str], list[Classification]] = defaultdict(list)
+        for c in records:
+            if c.part in kinds:
+                videos[kinds[c.part], c.video_id].append(c)
+        for (kind, video), own in videos.items():
+            right = {(kind, c.property): c.expected == c.predicted for c in own}
+            right[kind, "combined"] = all(right.values())
+            for c in own if kind == HEADS else ():
+                right[RECALL, f"{c.property}: {levels[c.property][c.expected]}"] = c.expected == c.predicted
+            same: dict[str, Any] = {"question_id": video, "objects": (own[0].object_id,), "parsed": True}
+            same |= {"truncated": False, "expected": "", "predicted": ""}
+            for (task, measure), correct in right.items():
+                entries.append((Score(task=task, measure=measure, correct=correct, **same), RULES, seed))
     order = [(kind, measure) for kind in kinds.values() for measure in TASKS["OPD"].chance(catalogue)]
     order += [(RECALL, f"{p.name}: {level}") for p in catalogue.properties for level in p.levels]
     return _tabled(entries, order)

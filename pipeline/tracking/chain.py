@@ -14,7 +14,7 @@ import yaml
 
 from pipeline.config import Params
 from pipeline.config.params import CHAIN, PARAMS_FILE
-from pipeline.core.io import read_json, read_table
+from pipeline.core.io import check_made, read_json, read_table
 from pipeline.core.layout import GRADED, REPORTS, RUNS
 from pipeline.core.records import Touch, Variant
 from pipeline.evaluation.records import Graded
@@ -41,7 +41,7 @@ class ChainStage(NamedTuple):
 def read_stages(params: Params) -> dict[str, ChainStage]:
     """Stages of dvc.yaml, without `publish`, that ran with these parameters, by titles such as `align@finetuned-all-0`.
 
-    dvc.yaml or dvc.lock is a UserError where it is missing, or no YAML of DVC's.
+    dvc.yaml or dvc.lock is a UserError where it is missing, or not as DVC writes it.
     """
     chain, today, found = _stages_in(CHAIN).keys() - {"publish"}, settings(params), {}
     for title, entry in _stages_in(CHAIN_LOCK).items():
@@ -66,16 +66,12 @@ def axes(title: str) -> dict[str, str]:
 
 
 def _stages_in(path: Path) -> dict[str, dict[str, Any]]:
+    check_made(path)
     try:
         found = yaml.load(path.read_text(encoding="utf-8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file; `dvc repro` makes it") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: not YAML ({' '.join(str(error).split())}); restore it from Git") from None
-    stages = (found.get("stages") or {}) if isinstance(found, dict) else {}
-    if not isinstance(stages, dict) or not all(isinstance(stage, dict) for stage in stages.values()):
-        raise UserError(f"{path}: not as DVC writes it; restore it from Git")
-    return stages
+        return {title: dict(stage) for title, stage in (found.get("stages") or {}).items()}
+    except (yaml.YAMLError, ValueError, TypeError, AttributeError) as error:
+        raise UserError(f"{path}: not as DVC writes it ({' '.join(str(error).split())}); restore it from Git") from None
 
 
 def settings(params: Params, own: Mapping[str, str] | None = None) -> dict[str, str]:

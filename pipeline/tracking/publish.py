@@ -112,14 +112,11 @@ def _variants(
     scores, new, links = accuracies(params), 0, dict[str, str]()
     store.kill({KIND: "variant"})
     for variant in params.ablation.variants():
-        stage = stages.get(f"answer@{variant.key}")
-        if stage is None:
+        if (stage := stages.get(f"answer@{variant.key}")) is None:
             continue
-        metrics, made = scores.get(variant.key, {}), {"predictions": answers_dir(variant)}
-        made |= {"model": trained_dir(variant), "alignment": trained_dir(variant._replace(lora=Lora.WITHOUT))}
-        made |= {"encoder": encoder_dir(variant.seed), "package": MODELS / variant.key}
+        metrics, package = scores.get(variant.key, {}), MODELS / variant.key
         # A folder that is packaged is whole when it has its card.
-        card = made["package"] / "config.json"
+        card = package / "config.json"
         content = digest([metrics, stage.outs, *([card.read_text(encoding="utf-8")] if card.is_file() else [])])
         if old := store.find({VARIANT: variant.key, CONTENT: content}):
             if old[0].data.tags.get(PARENT) != parent:
@@ -132,9 +129,13 @@ def _variants(
         # Whole tasks before their parts, as the dashboard keeps the order.
         ordered = sorted(metrics.items(), key=lambda metric: ("." in metric[0], metric[0]))
         store.log(run, [(name, value, end, 0) for name, value in ordered])
-        unused = {"alignment": variant.lora is Lora.WITHOUT, "encoder": variant.encoder is not Encoder.FINETUNED}
-        for place, path in made.items():
-            if path.is_dir() and not unused.get(place):
+        made = {"predictions": answers_dir(variant), "model": trained_dir(variant)}
+        if variant.lora is not Lora.WITHOUT:
+            made["alignment"] = trained_dir(variant._replace(lora=Lora.WITHOUT))
+        if variant.encoder is Encoder.FINETUNED:
+            made["encoder"] = encoder_dir(variant.seed)
+        for place, path in {**made, "package": package}.items():
+            if path.is_dir():
                 store.client.log_artifacts(run, str(path), place)
         store.finish(run, end, {CONTENT: content})
         new += 1

@@ -14,8 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager, nullcontext
-from functools import partial
+from contextlib import closing, contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -41,7 +40,7 @@ from pipeline.tracking.publish import publish
 from pipeline.tracking.store import TrackingError, out_of_reach
 from pipeline.training.trainer import TrainableTrainer, Trained, train, training_arguments
 from tests.closure import ROOT
-from tests.conftest import HUNG, deaf_port
+from tests.conftest import HUNG
 from tests.tracking.conftest import FIRST, FULL, FakeChain, by_name, client, losses, runs
 
 ALIGN = "align@finetuned-all-0"
@@ -208,24 +207,18 @@ def silent_server() -> Iterator[str]:
 
 
 @contextmanager
-def closed_port() -> Iterator[str]:
-    with deaf_port() as port:
-        yield f"http://127.0.0.1:{port}"
-
-
-@contextmanager
 def broken_database() -> Iterator[str]:
     Path("mlruns/mlflow.db").write_bytes(b"garbage " * 1000)
     yield ""
 
 
 @contextmanager
-def refusing_server(status: int = 401) -> Iterator[str]:
-    """Asks for a password, or answers as no server of today does."""
+def refusing_server() -> Iterator[str]:
+    """Asks for a password."""
 
     class Refusal(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            self.send_error(401) if status == 401 else self.wfile.write(b"HTTP/1.0 200 OK\r\n\r\n2.22.1")
+            self.send_error(401)
 
     with ThreadingHTTPServer(("127.0.0.1", 0), Refusal) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -237,11 +230,8 @@ def refusing_server(status: int = 401) -> Iterator[str]:
     ("dead", "cause"),
     [
         (silent_server, r"http://127\.0\.0\.1:\d+: TimeoutError: timed out"),
-        (closed_port, r"http://127\.0\.0\.1:\d+: ConnectionRefusedError: .*refused"),
         (refusing_server, r"http://\*\*\*@127.*401.*MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD"),
-        (partial(refusing_server, 200), r"http://\*\*\*@127.*: MlflowException: .*2\.22\.1"),
         (broken_database, r"mlflow\.db: .*file is not a database"),
-        (partial(nullcontext, "htp://ada:S3cret@nowhere"), r"htp://\*\*\*@nowhere: .*unsupported URI"),
     ],
 )
 def test_out_of_reach_costs_one_warning_and_one_call(

@@ -51,11 +51,10 @@ def test_a_reproduction_has_its_report_parameters_and_a_child_a_stage_and_a_vari
     assert seconds(parent) == len(TITLES) * (SECONDS + 1) - 1
     assert {seconds(run) for run in stages.values()} == {SECONDS}
     commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout.strip()
+    assert parent.data.tags["mlflow.source.git.commit"] == commit
     assert parent.data.metrics == {"full.PC": 0.5, "encoder.combined": 0.25}
     values = yaml.safe_load(Path("params.yaml").read_text())
     assert json.loads(parent.data.params["ablation.encoders"]) == values["ablation"]["encoders"]
-    assert parent.data.params["language.weights"] == values["language"]["weights"]
-    assert parent.data.tags["mlflow.source.git.commit"] == commit
     written = {a.path for a in client().list_artifacts(parent.info.run_id, "report")}
     assert written == {"report/README.md", "report/metrics.json", "report/scores.csv"}
 
@@ -94,12 +93,8 @@ def test_a_new_task_is_a_column_by_itself(again: FakeChain) -> None:
     experiment = client().get_experiment_by_name("octopi")
     view = json.loads(experiment.tags["mlflow.sharedViewState.variants"])
     tasks = ["metrics.`OPD`", "metrics.`PC`", "metrics.`TOY`"]
-    runs = [run.data.params for run in by_name("variant").values()]
-    factors = ("encoder", "lora", "opd", "seed")
-    differ = {name for run in runs for name in run if len({r.get(name) for r in runs}) > 1} - {*factors}
-    assert view["selectedColumns"][:3] == tasks
-    assert view["selectedColumns"][-4:] == [f"params.`{a}`" for a in factors]
-    assert {name[8:-1] for name in view["selectedColumns"][3:-4]} == differ
+    # Of the parameters only the factors differ.
+    assert view["selectedColumns"] == [*tasks, *(f"params.`{a}`" for a in ("encoder", "lora", "opd", "seed"))]
     found = client().search_runs([experiment.experiment_id], view["searchFilter"])
     assert {run.info.run_name for run in found} == {FULL, BASE}
     assert "viewStateShareKey=variants" in experiment.tags["mlflow.note.content"]
@@ -226,9 +221,9 @@ def test_the_command_says_what_was_added_or_in_one_line_why_it_could_not(chain: 
     client().delete_experiment(client().get_experiment_by_name("octopi").experiment_id)
     with refused("tracking.experiment: octopi was deleted"):
         publish(chain.params)
-    for text, words in (("{", "not YAML"), ("stages: [split]", "not as DVC writes it"), (None, "no such file")):
-        Path("dvc.lock").unlink() if text is None else Path("dvc.lock").write_text(text)
-        with refused(f"dvc.lock: {words}"):
+    for text in ("{", "stages: [split]", "stages: {split: 3}"):
+        Path("dvc.lock").write_text(text)
+        with refused(r"dvc.lock: not as DVC writes it \(.*from Git"):
             publish(chain.params)
 
 
@@ -240,25 +235,20 @@ with stage("publish") as run:
 """
 
 
-def test_an_experiment_publishes_into_the_project_and_by_its_own_code(chain: FakeChain) -> None:
+def test_an_experiment_publishes_into_the_project(chain: FakeChain) -> None:
     """DVC runs it in a copy of what Git has, and deletes the copy."""
-    shutil.copytree(ROOT / "pipeline", "pipeline", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / ".gitignore", ".")
     Path("stages").mkdir()
     Path("stages/publish.py").write_text(PUBLISH)
     Path("dvc.yaml").write_text(CHAIN.replace("publish: {cmd: x}", "publish: {cmd: python stages/publish.py}"))
-    Path("pipeline/tracking/__init__.py").write_text("print('of the project')")
     environment = {**os.environ, "GIT_CONFIG_GLOBAL": os.devnull, "PYTHONPATH": str(ROOT)}
     environment["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
 
     def run(command: str) -> str:
-        done = subprocess.run(command, shell=True, env=environment, text=True, capture_output=True, check=False)
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done.stdout + done.stderr
+        return subprocess.run(command, shell=True, env=environment, text=True, capture_output=True, check=True).stdout
 
     run("git init -q && git config user.name a && git config user.email a@b && dvc init -q")
-    run("git add . && git commit -qm a")
-    assert "of the project\n" in run("dvc exp run --temp --single-item publish")
+    run("git add . && git commit -qm a && dvc exp run --temp --single-item publish")
     (parent,) = runs("reproduction")
     assert {a.path for a in client().list_artifacts(parent.info.run_id)} == {"report"}
     written = set(Path("mlruns/artifacts").rglob("*"))
@@ -269,23 +259,20 @@ def test_an_experiment_publishes_into_the_project_and_by_its_own_code(chain: Fak
 
 
 def test_a_packaged_folder_is_logged_with_its_card(again: FakeChain) -> None:
-    folder, cached = Path("models") / FULL, Path("cached").absolute()
+    folder = Path("models") / FULL
     folder.mkdir(parents=True)
     for minutes, text in ((60, "x"), (120, "y")):
-        # As DVC's `cache.type symlink` leaves it: the name in models/, the file in the cache, read-only.
-        (cached / text).mkdir(parents=True)
         for name in ("config.json", "README.md"):
-            (cached / text / name).write_text(text)
-            (cached / text / name).chmod(0o444)
+            # As DVC's `cache.type symlink` leaves it: the name in models/, the file in the cache, read-only.
+            file = Path(f"{text}-{name}").absolute()
+            file.write_text(text)
+            file.chmod(0o444)
             (folder / name).unlink(missing_ok=True)
-            (folder / name).symlink_to(cached / text / name)
+            (folder / name).symlink_to(file)
         again.ran(["grade"], minutes)
         publish(again.params)
-        (last,) = [
-            run
-            for run in runs("variant")
-            if run.data.tags["mlflow.parentRunId"] == runs("reproduction")[-1].info.run_id
-        ]
+        parent = runs("reproduction")[-1].info.run_id
+        (last,) = [run for run in runs("variant") if run.data.tags["mlflow.parentRunId"] == parent]
         for name in ("config.json", "README.md"):
             copy = Path(mlflow.artifacts.download_artifacts(f"{last.info.artifact_uri}/package/{name}"))
             assert (copy.is_symlink(), copy.read_text()) == (False, text)
