@@ -13,7 +13,7 @@ from pipeline.videos.records import Assignment
 if __name__ == "__main__":
     encoder, opd, seed = matrix_key(encoder=Encoder, opd=Opd, seed=None)
     out = trained_dir(Variant(encoder, Lora.WITHOUT, opd, seed))
-    with stage("align", out.name, launched=True) as run:
+    with stage("align", out.name, launched=True, of_variants=True) as run:
         from pipeline.language.begin import begin_with_words
         from pipeline.language.octopi import ADAPTER_DIR
         from pipeline.language.training import Job, Material, assemble, fit, write_model_card

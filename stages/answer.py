@@ -13,7 +13,7 @@ from pipeline.videos.catalogue import load_catalogue
 
 if __name__ == "__main__":
     variant = Variant(*matrix_key(encoder=Encoder, lora=Lora, opd=Opd, seed=None))
-    with stage("answer", variant.key) as run:
+    with stage("answer", variant.key, of_variants=True) as run:
         from pipeline.language.classes import in_words
         from pipeline.language.generate import ModelSource, answer
         from pipeline.language.input_ablation import ablate_input

@@ -38,7 +38,7 @@ def write(run: Stage, out: Path, split: Sequence[Assignment], raw: torch.Tensor,
 
 
 if __name__ == "__main__":
-    with stage("embed") as run:
+    with stage("embed", of_variants=True) as run:
         import torch
 
         from pipeline.encoder.embed import EncoderSource, embed_videos, logits_of, standardize, statistics, union

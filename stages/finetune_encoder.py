@@ -15,7 +15,7 @@ from pipeline.weights.backbones import backbone_files, check_encoder
 
 if __name__ == "__main__":
     (seed,) = matrix_key(seed=None)
-    with stage("finetune_encoder", str(seed)) as run:
+    with stage("finetune_encoder", str(seed), of_variants=True) as run:
         from pipeline.encoder.data import EncoderData, classify
         from pipeline.encoder.finetune import Training, finetune, write_encoder_card
         from pipeline.training.trainable import save_trainable

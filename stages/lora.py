@@ -9,7 +9,7 @@ from pipeline.tracking.live import live
 if __name__ == "__main__":
     encoder, opd, seed = matrix_key(encoder=Encoder, opd=Opd, seed=None)
     aligned, out = (trained_dir(Variant(encoder, lora, opd, seed)) for lora in (Lora.WITHOUT, Lora.WITH))
-    with stage("lora", out.name, launched=True) as run:
+    with stage("lora", out.name, launched=True, of_variants=True) as run:
         from pipeline.language.lora import add_lora
         from pipeline.language.training import Job, Material, assemble, fit, write_model_card
 

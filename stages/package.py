@@ -1,5 +1,7 @@
 """Put each full system, or with `packaged=all` each variant, into one folder that it can be used from."""
 
+import re
+import shutil
 from pathlib import Path
 
 from pipeline.core.layout import MODELS
@@ -11,8 +13,13 @@ if __name__ == "__main__":
         from pipeline.use.package import package
 
         params = run.params
+        MODELS.mkdir(exist_ok=True)
         base = Base.of(Path(params.language.weights))
         wanted = [v for v in params.ablation.variants() if v.full or params.packaged == "all"]
+        # DVC leaves the folder as it is, since models that no run made lie there, too.
+        for folder in MODELS.iterdir():
+            if re.fullmatch(r"\w+-\w+-\w+-\d+", folder.name) and folder.name not in {v.key for v in wanted}:
+                shutil.rmtree(folder)
         for variant in wanted:
             package(params, variant, base, MODELS / variant.key)
         run.metrics["models"] = len(wanted)

@@ -358,6 +358,8 @@ class AblationConfig(Section):
     """`without` answers with the alignment's checkpoint."""
     opd: tuple[Opd, ...] = (Opd.ALL, Opd.NONE)
     """How much an answer describes before it concludes: `all`, what is `needed` for the question, or `none`."""
+    train: bool = True
+    """False: no variant is trained, and the run only evaluates the models of `evaluate.models`."""
     seeds: tuple[Seed, ...] = Field(default=(0,), min_length=1)
     """With split.name=kfold seeds are folds: [0, 1, 2] of three folds tests each object once, [0, ..., 5] twice."""
     touch: tuple[Literal[Touch.REMOVED, Touch.SWAPPED, Touch.NOISE], ...] = ()
@@ -366,7 +368,7 @@ class AblationConfig(Section):
     @model_validator(mode="after")
     def _lists_make_sense(self) -> Self:
         full = {"encoders": Encoder.FINETUNED, "lora": Lora.WITH, "opd": Opd.ALL}
-        for name in type(self).model_fields:
+        for name in type(self).model_fields.keys() - {"train"}:
             values = [str(v) for v in getattr(self, name)]
             if len(set(values)) < len(values):
                 raise ValueError(f"ablation.{name} [{', '.join(values)}] repeats a value")
@@ -376,12 +378,26 @@ class AblationConfig(Section):
 
     def variants(self) -> list[Variant]:
         """All answering systems, in the lists' order; input ablations belong to the full system alone."""
-        chosen = product(self.seeds, self.encoders, self.lora, self.opd)
+        chosen = product(self.seeds, self.encoders, self.lora, self.opd) if self.train else ()
         return [Variant(encoder, lora, opd, seed) for seed, encoder, lora, opd in chosen]
 
     def touches(self, variant: Variant) -> tuple[Touch, ...]:
         """What a variant is asked with: the questions' videos, and the full system also with every input ablation."""
         return (Touch.REAL, *(self.touch if variant.full else ()))
+
+
+class EvaluateConfig(Section):
+    """Trained models that answer questions about the run's videos, with no training of this run."""
+
+    models: tuple[str, ...] = ()
+    """Folders of models/, or octopi-small, the one that is shipped. DVC tracks that one, and of others only the name:
+    `dvc repro --force evaluate` asks a model that has changed."""
+    objects: Literal["test", "all"] = "test"
+    """Which objects they are asked about; a model that has met one of them is refused."""
+    questions: Annotated[Whole, Field(ge=0)] = 0
+    """How many, half of them descriptions; 0: as many as questions.evaluation says."""
+    repeats: Positive = 1
+    """Sets of questions about the same objects, to see how far accuracy moves from set to set."""
 
 
 class TrackingConfig(Section):
@@ -444,8 +460,7 @@ class Params(Section):
     align: AlignConfig
     lora: LoraTrainConfig
     ablation: AblationConfig
-    shipped: Annotated[Whole, Field(ge=0)] = 0
-    """Number of questions about this run's videos for the shipped model (`pipeline/pretrained`)."""
+    evaluate: EvaluateConfig = EvaluateConfig()
     packaged: Literal["full", "all"] = "full"
     """Which variants get a folder in models/: the full system of each seed, or all. Each holds the whole encoder."""
     tracking: TrackingConfig

@@ -19,6 +19,7 @@ PARAMS_FILE, CHAIN, CONF = Path("params.yaml"), Path("dvc.yaml"), Path("conf")
 PACKAGE = Path(__file__).parents[1]
 FORMER = {
     "frames.size": "is called frames.pixels now; write that name",
+    "shipped": "is the section `evaluate` now: write evaluate.models=[octopi-small] and evaluate.questions",
     "cross_validation": "is no section any more; remove it: the folds of split.name=kfold test every object once",
 }
 """Parameters of earlier versions, and what took their place."""

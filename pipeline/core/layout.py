@@ -16,7 +16,7 @@ SCENES_DIR = DATA / "scenes" / "videos"
 PRETRAINED = DATA / "pretrained" / "encoder.safetensors"
 """The network that is pretrained on synthetic pictures, the backbone `scenes`."""
 VIDEOS, FRAMES, AUDIT, QUESTIONS = DATA / "videos.parquet", DATA / "frames", DATA / "audit", DATA / "questions"
-GRADED, GRADED_VISION, GRADED_SHIPPED = (DATA / f"{name}.parquet" for name in ("graded", "graded_vision", "shipped"))
+GRADED, GRADED_VISION, EVALUATED = (DATA / f"{name}.parquet" for name in ("graded", "graded_vision", "evaluated"))
 HISTORY_FILE, TRAINED_FILE, CLASSIFIED_FILE = "history.parquet", "encoder.safetensors", "classifications.parquet"
 """In a training's folder its curves, and in the encoder's its weights and what its heads say of held-out videos."""
 

@@ -59,7 +59,7 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     videos = read_table(root / layout.VIDEOS, Video)
     splits = list(read_splits(params.split, params.ablation.seeds, root).values())
     graded = read_table(root / layout.GRADED, Graded)
-    vision = [*_read(root / layout.GRADED_VISION, GradedVision), *_read(root / layout.GRADED_SHIPPED, GradedVision)]
+    vision = [*_read(root / layout.GRADED_VISION, GradedVision), *_read(root / layout.EVALUATED, GradedVision)]
     # By the lists in params.yaml, not by the files: after an ablation is narrowed, files of removed variants remain.
     files = {seed: root / layout.encoder_dir(seed) / layout.CLASSIFIED_FILE for seed in sorted(params.ablation.seeds)}
     by_encoder = {seed: said for seed, file in files.items() if (said := _read(file, Classification))}

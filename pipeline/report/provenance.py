@@ -35,7 +35,7 @@ ARCHITECTURES = {
     "tf_efficientnet_lite0": "EfficientNet-Lite0",
 }
 UNTOLD = {
-    *("scale", "seed", "kernels", "data", "invent", "scenes", "split", "ablation", "shipped"),
+    *("scale", "seed", "kernels", "data", "invent", "scenes", "split", "ablation", "evaluate"),
     *("packaged", "tracking", "runtime", "weights", "evaluation"),
     *("micro_batch_size", "embed_batch_size", "generation_batch_size"),
 }

@@ -27,8 +27,8 @@ from filelock import FileLock, Timeout
 
 from pipeline.config import Params
 from pipeline.config.params import CHAIN, PARAMS_FILE, load_params
-from pipeline.core.io import code_of, remove_rests, sha256, write_json
-from pipeline.core.layout import CHECKPOINTS, DATA, MODELS, REPORTS, RUNS
+from pipeline.core.io import code_of, remove_rests, sha256, write_json, write_text
+from pipeline.core.layout import CHECKPOINTS, DATA, MODELS, REPORTS, RUNS, embeddings_dir
 from pipeline.core.records import Measurement
 from pipeline.core.runtime import cores, limit_threads, processor, use_kernels
 from pipeline.running.errors import UserError
@@ -98,11 +98,15 @@ def launch(launcher: str) -> None:
 
 
 @contextmanager
-def stage(name: str, key: str | None = None, *, launched: bool = False) -> Iterator[Stage]:
+def stage(
+    name: str, key: str | None = None, *, launched: bool = False, of_variants: bool = False
+) -> Iterator[Stage]:
     """Run the body as the DVC stage `name` (with `@key` in a matrix).
 
     Args:
         launched: Whether `runtime.launcher` starts it; this process ends there.
+        of_variants: Whether it belongs to this run's own models: with `ablation.train=false` it leaves empty folders
+            and ends.
 
     What computes is imported in the body, since libraries choose their kernels when they are loaded, and `kernels`
     of params.yaml chooses first.
@@ -122,6 +126,14 @@ def stage(name: str, key: str | None = None, *, launched: bool = False) -> Itera
                 raise UserError(f"{variable} is set, which changes the format that numbers are computed in; unset it")
         params = load_params()
         use_kernels(params.kernels)
+        if of_variants and not params.ablation.train:
+            empty = _paths(Stage(full, params))
+            if name == "embed":
+                empty = [embeddings_dir(e, seed) for e in params.ablation.encoders for seed in params.ablation.seeds]
+            for folder in empty:  # Not quite empty, of which DVC would warn.
+                write_text(folder / "not_trained", "")
+            print(f"{full}: nothing to do, since ablation.train is false", flush=True)
+            sys.exit(0)
         if launched:
             launch(params.runtime.launcher)
         with alone(full):
@@ -243,13 +255,18 @@ def _write_run(running: Stage) -> None:
 
 def _outs(running: Stage) -> dict[str, str]:
     """Hashes of a stage's outputs by path, as dvc.lock will have them: other runs' have others."""
+    return {str(path): _md5(path) for path in _paths(running) if path.exists()}
+
+
+def _paths(running: Stage) -> list[Path]:
+    """The outputs of a stage, by dvc.yaml."""
     name, _, key = running.name.partition("@")
     listed = yaml.safe_load(CHAIN.read_bytes())["stages"].get(name, {}) if CHAIN.is_file() else {}
-    outs = [str(*out) if isinstance(out, dict) else out for kind in ("outs", "metrics") for out in listed.get(kind, ())]
+    outs = [next(iter(o)) if isinstance(o, dict) else o for kind in ("outs", "metrics") for o in listed.get(kind, ())]
     # A stage of a matrix is called by its values with hyphens between, as what it writes is.
     named = re.sub(r"\$\{item\..*\}", key, "\n".join(outs))
-    paths = re.sub(r"\$\{([\w.]+)\}", lambda name: str(attrgetter(name[1])(running.params)), named).splitlines()
-    return {path: _md5(Path(path)) for path in paths if Path(path).exists()}
+    found = re.sub(r"\$\{([\w.]+)\}", lambda name: str(attrgetter(name[1])(running.params)), named)
+    return [Path(path) for path in found.splitlines()]
 
 
 def _md5(path: Path) -> str:
@@ -258,5 +275,7 @@ def _md5(path: Path) -> str:
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "md5").hexdigest()
     files = sorted((file.relative_to(path).as_posix(), file) for file in path.rglob("*") if file.is_file())
+    # As .dvcignore has it: models that no run made.
+    files = [(name, file) for name, file in files if path != MODELS or not name.startswith("octopi-")]
     listed = [{"md5": _md5(file), "relpath": name} for name, file in files]
     return f"{hashlib.md5(json.dumps(listed).encode()).hexdigest()}.dir"

@@ -210,7 +210,7 @@ def described(model: Octopi, paths: Sequence[Path]) -> tuple[Table, list[str]]:
     notes, errors = [*model.doubts], list[str]()
     for row in _describe(model, files):
         found = [(row.get(p), row.get(f"{p}: {row.get(p)}")) for p in model.properties]
-        cells = [f"{level} ({share:.0%})" if share else level or "" for level, share in found]
+        cells = [f"{level} ({share:.0%})" if share else str(level or "") for level, share in found]
         table.add_row(*map(escape, (str(row["file"]), *cells, str(row.get("sentence", "")))))
         notes += [f"{row['file']}: {row['notes']}"] if row.get("notes") else []
         errors += [str(row["error"])] if row.get("error") else []

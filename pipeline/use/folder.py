@@ -105,8 +105,10 @@ class ModelConfig(Record):
     def digest(self) -> str:
         """A hash of all that answers depend on, by which two trainings of one variant are told apart."""
         # Folders that were made before a setting was there keep their hash.
-        later = {"objects": True, "heads": self.heads, "language": {"chat"} if self.language.chat == "template" else {}}
-        told = self.model_copy(update={"scores": {}, "versions": {}}).model_dump(mode="json", exclude=later)
+        told = self.model_copy(update={"scores": {}, "versions": {}}).model_dump(mode="json", exclude={"objects"})
+        for section, setting, usual in ((told, "heads", True), (told["language"], "chat", "template")):
+            if section[setting] == usual:
+                del section[setting]
         return fingerprint(json.dumps(told, sort_keys=True))
 
 
