@@ -31,5 +31,7 @@ if __name__ == "__main__":
         several = [name for name, count in Counter(map(str, params.evaluate.models)).items() if count > 1]
         if several:
             raise UserError(f"evaluate.models names {several[0]} twice; name each once")
-        run.metrics["answers"] = len({(g.model, g.shown, g.question_id) for g in graded if g.shown is not Shown.CLASSES})
+        run.metrics["answers"] = len(
+            {(g.model, g.shown, g.question_id) for g in graded if g.shown is not Shown.CLASSES}
+        )
         write_table(EVALUATED, GradedVision, graded)

@@ -117,7 +117,7 @@ def ask_all(
                 outputs = [_description(replies, catalogue)]
             else:
                 # As the full system is asked; every task has this mode.
-                (turns,) = ([turn.user for turn in d.turns] for d in question.dialogues if d.opd is Opd.ALL)
+                turns = [turn.user for turn in next(d for d in question.dialogues if d.opd is Opd.ALL).turns]
                 replies = _converse([told[seed, question.task] + turns[0], *turns[1:]], question.videos, asker, show)
                 outputs = [r.text for r in replies] + [""] * (len(turns) - len(replies))
             used |= {reply.request: reply for reply in replies}

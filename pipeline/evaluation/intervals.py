@@ -6,6 +6,9 @@ moments: sums of squares are set equal to what they are expected to be (Henderso
 McCulloch 1992), with one component for objects, one for sets of objects that questions come back to, and one for
 questions. For questions about one object, as many about each, that is the usual cluster-robust variance.
 
+Resampling objects would be shorter, but holds too little: of simulated truths about 7 objects with 5 questions each,
+these intervals hold 95 to 98 %, scipy's BCa bootstrap 87 to 95 %; about 20 objects 95 to 97 %, and 93 to 96 %.
+
 Values are arrays (..., questions): many data sets may be taken at once.
 
 Sources: Wilson 1927; Kish 1965 (effective number); Korn and Graubard 1998 and Franco, Little, Louis, Slud 2019 (both

@@ -60,23 +60,24 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     splits = list(read_splits(params.split, params.ablation.seeds, root).values())
     graded = read_table(root / layout.GRADED, Graded)
     vision = [*_read(root / layout.GRADED_VISION, GradedVision), *_read(root / layout.EVALUATED, GradedVision)]
-    # By the lists in params.yaml, not by the files: after an ablation is narrowed, files of removed variants remain.
-    files = {seed: root / layout.encoder_dir(seed) / layout.CLASSIFIED_FILE for seed in sorted(params.ablation.seeds)}
-    by_encoder = {seed: said for seed, file in files.items() if (said := _read(file, Classification))}
-    asked = {seed: read_jsonl(root / layout.questions_file(seed), Question) for seed in by_encoder}
-    # With the folds of a replicate pooled, the heads' classifications and what follows from them by rule.
+    # The heads' classifications; and, with the folds of a replicate pooled, these and what follows from them by rule.
+    by_encoder: dict[int, list[Classification]] = {}
     pooled: dict[int, list[Classification]] = defaultdict(list)
     concluded: dict[int, list[Score]] = defaultdict(list)
     # As the stage `questions` took it.
     taken = catalogue.asking(params.questions.scenarios).called(params.questions.names)
-    for seed, classified in by_encoder.items():
-        # A video may be in the validation part of several folds, each time another encoder's. Replicates share folds.
-        fold = params.split.fold_of(seed)
-        pooled[params.split.replicate_of(seed)] += [
-            c.model_copy(update={"video_id": f"{c.video_id}@{fold}"}) if c.part is Part.VALIDATION else c
-            for c in classified
-        ]
-        concluded[params.split.replicate_of(seed)] += conclude(asked[seed], classified, taken)
+    # By the lists in params.yaml, not by the files: after an ablation is narrowed, files of removed variants remain.
+    for seed in sorted(params.ablation.seeds):
+        if classified := _read(root / layout.encoder_dir(seed) / layout.CLASSIFIED_FILE, Classification):
+            by_encoder[seed] = classified
+            asked = read_jsonl(root / layout.questions_file(seed), Question)
+            concluded[params.split.replicate_of(seed)] += conclude(asked, classified, taken)
+            # A video may be in the validation part of several folds, each time another encoder's.
+            fold = params.split.fold_of(seed)
+            pooled[params.split.replicate_of(seed)] += [
+                c.model_copy(update={"video_id": f"{c.video_id}@{fold}"}) if c.part is Part.VALIDATION else c
+                for c in classified
+            ]
     origin = provenance(params, catalogue, videos, splits, [g.objects for g in graded], root)
     # Without those whose answers are to other questions than today's, which were not graded.
     rated = {(g.model, g.shown) for g in vision}

@@ -89,7 +89,8 @@ def provenance(
         "data_sha256": hashlib.sha256(rows.encode()).hexdigest(),
         "encoder": encoder_words(params.encoder),
         "base_models": {part: base_model(root, getattr(params, part).weights) for part in based},
-        "own_backbones": own_backbones(params.encoder),
+        # In words, those of the base encoder's backbones that the chain pretrains itself.
+        "own_backbones": [BACKBONES[b].words for b in params.encoder.backbone if BACKBONES[b].key != "weights"],
         "python": ".".join(platform.python_version_tuple()[:2]),
         "packages": {name: metadata.version(name) for name in PACKAGES},
     }
@@ -124,11 +125,6 @@ def encoder_words(config: EncoderConfig) -> str:
     }.get(config.recipe, f"an encoder of the recipe `{config.recipe}`")
     words += ", on pictures of the difference to the untouched gel" if config.reference == "subtract" else ""
     return words + ("; the language model gets its heads' logits" if config.embedding == "logits" else "")
-
-
-def own_backbones(config: EncoderConfig) -> list[str]:
-    """In words, those of the base encoder's backbones that the chain pretrains itself."""
-    return [BACKBONES[name].words for name in config.backbone if BACKBONES[name].key != "weights"]
 
 
 def base_model(root: Path, folder: str) -> dict[str, Any]:

@@ -98,9 +98,7 @@ def launch(launcher: str) -> None:
 
 
 @contextmanager
-def stage(
-    name: str, key: str | None = None, *, launched: bool = False, of_variants: bool = False
-) -> Iterator[Stage]:
+def stage(name: str, key: str | None = None, *, launched: bool = False, of_variants: bool = False) -> Iterator[Stage]:
     """Run the body as the DVC stage `name` (with `@key` in a matrix).
 
     Args:

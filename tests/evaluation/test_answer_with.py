@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import functools
 import io
+import itertools
 import json
 import re
 import runpy
@@ -127,19 +128,14 @@ def run(*more: str, shown: str = "frames", refused: bool = False, url: str = URL
 
 def shown_in(content: list[dict[str, Any]]) -> tuple[str, list[list[Image.Image]]]:
     """The text of a message with `{tactile}` for each run of pictures, and these pictures."""
-    text, pictures, last = "", [], "text"
-    for part in content:
-        if part["type"] == "text":
-            text += part["text"]
+    text, pictures = "", []
+    for kind, parts in itertools.groupby(content, lambda part: part["type"]):
+        if kind == "text":
+            text += "".join(part["text"] for part in parts)
         else:
-            kind, _, data = part["image_url"]["url"].partition(";base64,")
-            picture = Image.open(io.BytesIO(base64.b64decode(data, validate=True)))
-            assert kind == f"data:image/{picture.format.lower()}"
-            if last == "text":
-                text += "{tactile}"
-                pictures.append([])
-            pictures[-1].append(picture)
-        last = part["type"]
+            urls = [re.fullmatch(r"data:image/(png|jpeg);base64,(.*)", part["image_url"]["url"]) for part in parts]
+            pictures.append([Image.open(io.BytesIO(base64.b64decode(url[2])), formats=[url[1]]) for url in urls])
+            text += "{tactile}"
     return text, pictures
 
 

@@ -206,10 +206,3 @@ def test_the_papers_examples_are_shown_right_and_wrong(changed: Path) -> None:
     assert [words(e[0]) for e in shown] == ["rice (train): right", "rice (train): wrong"]
     assert words(shown[0][1]).startswith("Asked Describe. Answered Rough. Asked Cooked? Answered Uncooked. Read as")
     assert "for want of videos: toothbrush (of handle and bristles)." in words(page.named("small-videos"))
-
-
-def test_speed_and_stability_are_told(page: Page, made: Path) -> None:
-    settings = Counter(row["setting"] for row in rows_of(made / "reports" / "speed_error.csv"))
-    told = [words(head) for head in page.named("speed").iterfind(".//tbody/tr/th")]
-    assert Counter(told) == settings
-    assert "2 hard cases, 1 failed" in words(page.named("stability"))

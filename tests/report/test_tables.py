@@ -26,21 +26,6 @@ def build(key: str, *rows: dict[str, object], dataset: str = load.DATASET) -> pd
     return BY_KEY[key].build(report(rows, dataset=dataset))
 
 
-def test_a_row_is_written_as_by_hand_with_published_figures_in_their_own_columns() -> None:
-    (row,) = build("understanding", score("PC")).to_dict("records")
-    assert row == {
-        "Task": "Property Comparison (PC)",
-        "System": "Octopi (full system)",
-        "Measured % [95 %]": "50.0 [35.0, 65.0]",
-        "n (sets of objects)": "40 (9)",
-        "Chance %": "33.3",
-        "Unread %": "10.0",
-        "Published 7b % (n, ~ inferred)": "48.10 (~158)",
-        "Published 13b % (n, ~ inferred)": "55.06 (~158)",
-    }
-    assert list(build("touch", score(unread=None))["Unread %"]) == [""], "it was not counted"
-
-
 def test_all_of_the_papers_combinations_stand_beside_the_ratings(catalogue: Catalogue) -> None:
     """Also those that no object has by its ratings: the paper's counts add up to its 74 objects."""
     rows = dataset_frame(catalogue, [], []).set_index("table").loc["property_combinations"]
@@ -67,6 +52,7 @@ def test_effects_are_written_in_points_and_what_is_unknown_is_empty() -> None:
     assert list(shown["p"]) == ["0.200", ""]
     assert list(shown["Smallest that could be found, before Holm"]) == ["25.0", "25.0"]
     assert BY_KEY["touch_effects"].build(report(effects=rows)).empty
+    assert list(build("touch", score(unread=None))["Unread %"]) == [""], "it was not counted"
 
 
 @pytest.mark.parametrize(
