@@ -217,7 +217,7 @@ def _main_process() -> bool:
 
 
 def _write_run(running: Stage) -> None:
-    """Write runs/NAME.json: times, seconds, device, most memory in MiB (a GPU's, if one was used), metrics, outputs."""
+    """Write runs/NAME.json: times, device, most memory in MiB (a GPU's, if one was used), metrics, outputs by hash."""
     import resource
 
     import psutil
@@ -227,6 +227,12 @@ def _write_run(running: Stage) -> None:
     device, torch = f"{processor()}, {cores()} cores", sys.modules.get("torch")
     if torch is not None and torch.cuda.is_initialized() and (most := torch.cuda.max_memory_allocated()):
         device, peak = torch.cuda.get_device_name(), most / 2**20
+    name, _, key = running.name.partition("@")
+    listed = yaml.safe_load(CHAIN.read_bytes())["stages"].get(name, {}) if CHAIN.is_file() else {}
+    outs = [str(*out) if isinstance(out, dict) else out for kind in ("outs", "metrics") for out in listed.get(kind, ())]
+    # A stage of a matrix is called by its values with hyphens between, as what it writes is.
+    named = re.sub(r"\$\{item\..*\}", key, "\n".join(outs))
+    paths = re.sub(r"\$\{([\w.]+)\}", lambda name: str(attrgetter(name[1])(running.params)), named).splitlines()
     write_json(
         RUNS / f"{running.name}.json",
         {
@@ -237,20 +243,10 @@ def _write_run(running: Stage) -> None:
             "device": device,
             "peak_memory_mb": round(peak, 1),
             "metrics": running.metrics,
-            "outs": _outs(running),
+            # As dvc.lock will have them: other runs' have others.
+            "outs": {path: _md5(Path(path)) for path in paths if Path(path).exists()},
         },
     )
-
-
-def _outs(running: Stage) -> dict[str, str]:
-    """Hashes of a stage's outputs by path, as dvc.lock will have them: other runs' have others."""
-    name, _, key = running.name.partition("@")
-    listed = yaml.safe_load(CHAIN.read_bytes())["stages"].get(name, {}) if CHAIN.is_file() else {}
-    outs = [str(*out) if isinstance(out, dict) else out for kind in ("outs", "metrics") for out in listed.get(kind, ())]
-    # A stage of a matrix is called by its values with hyphens between, as what it writes is.
-    named = re.sub(r"\$\{item\..*\}", key, "\n".join(outs))
-    paths = re.sub(r"\$\{([\w.]+)\}", lambda name: str(attrgetter(name[1])(running.params)), named).splitlines()
-    return {path: _md5(Path(path)) for path in paths if Path(path).exists()}
 
 
 def _md5(path: Path) -> str:
