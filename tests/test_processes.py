@@ -110,22 +110,17 @@ def test_a_stage_runs_the_code_beside_it_or_refuses(tmp_path: Path) -> None:
     write_params(compose("smoke", conf=ROOT / "conf"), clone / "params.yaml")
     linked.symlink_to(clone)
 
-    def split(folder: Path, code: Path) -> tuple[str, str]:
-        command = [sys.executable, "stages/split.py"]
-        environment = {**ENVIRONMENT, "PYTHONPATH": str(code)}
+    other = f"split: {ROOT / 'pipeline'} would run, but dvc.lock records {clone / 'pipeline'}"
+    for folder, code, started, stopped in (
+        (clone, ROOT, "", other),
+        (linked, ROOT, "", other),
+        (clone, linked, "split: starts (smoke-scenes)\n", "data/videos.parquet: no such file"),
+        (linked, clone, "split: starts (smoke-scenes)\n", "data/videos.parquet: no such file"),
+    ):
+        command, environment = [sys.executable, "stages/split.py"], {**ENVIRONMENT, "PYTHONPATH": str(code)}
         done = subprocess.run(command, cwd=folder, env=environment, text=True, capture_output=True, check=False)
-        assert done.returncode == 1
-        return done.stdout, done.stderr
-
-    for folder in (clone, linked):
-        started, stopped = split(folder, ROOT)
-        assert started == ""
-        assert stopped.count("\n") == 1
-        assert f"split: {ROOT / 'pipeline'} would run, but dvc.lock records {clone / 'pipeline'}" in stopped
-        for code in (clone, linked):
-            started, stopped = split(folder, code)
-            assert started == "split: starts (smoke-scenes)\n"
-            assert "data/videos.parquet: no such file" in stopped
+        assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, started, 1)
+        assert stopped in done.stderr
 
 
 STARTED = """
@@ -230,18 +225,12 @@ def test_a_folder_that_was_killed_is_made_anew_and_one_in_the_making_left_alone(
 
 def test_any_path_is_printed(tmp_path: Path) -> None:
     """On a terminal whose locale takes no bytes but UTF-8."""
-    out = not_utf8(tmp_path, "found?.csv")
-    command = [sys.executable, "-c", "from pipeline.cli import main; main()", "data", "audit"]
+    command = [sys.executable, "-c", "from pipeline.cli import main; main()", "data", "audit", not_utf8(tmp_path, "a?")]
     env = {**ENVIRONMENT, "PYTHONIOENCODING": "utf-8:strict"}
-    done = subprocess.run(
-        [*command, not_utf8(tmp_path, "none?"), "--out", out],
-        cwd=tmp_path, env=env, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (1, "")
-    first, second = done.stdout.splitlines()[:2]
-    assert first.endswith(rf" findings in {tmp_path}/found\udcff.csv")
-    assert rf"{tmp_path}/none\udcff: no such folder" in second
-    assert rf"{tmp_path}/none\udcff,no such folder" in out.read_text(encoding="utf-8")
+    assert rf"{tmp_path}/a\udcff: no such folder" in done.stdout
+    assert rf"{tmp_path}/a\udcff,no such folder" in (tmp_path / "audit.csv").read_text(encoding="utf-8")
 
 
 SCRIPT = """
@@ -326,8 +315,7 @@ if __name__ == "__main__":
 
 def run_script(text: str, folder: Path, *arguments: str) -> None:
     (folder / "work.py").write_text(text)
-    env = {**ENVIRONMENT, "PYTHONWARNINGS": "ignore"}
-    command = [sys.executable, "work.py", *arguments]
+    command, env = [sys.executable, "work.py", *arguments], {**ENVIRONMENT, "PYTHONWARNINGS": "ignore"}
     done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
 
