@@ -72,13 +72,10 @@ def test_committed_params_are_written_as_they_are(tmp_path: Path) -> None:
             "lora.skip_contradicted.*questions.two_turns=0",
         ),
         (["ablation.lora=[perhaps]"], "ablation.lora.*'with' or 'without'"),
-        (["lora.target_modules=all"], "lora.target_modules.*'all-linear'"),
-        (["runtime.device=tpu"], "runtime.device.*'cuda'"),
         (["lora.alpha=1e309"], "lora.alpha.*finite"),
         (["encoder.epochs=true"], "encoder.epochs is True: .*valid integer"),
         (["a b=[1"], "a b"),
         (["encoder.backbone=[timm,timm]"], "names one twice"),
-        (["encoder.backbone=[]"], "at least 1 item"),
         (
             ["encoder.recipe=tuned", "encoder.backbone=[scenes]", "encoder.reference=none"],
             "set encoder.reference=subtract",
@@ -91,12 +88,9 @@ def test_wrong_override_is_one_line_with_key_and_mend(overrides: list[str], word
         compose("smoke", overrides, conf=CONF)
 
 
-@pytest.mark.parametrize("text", [b"\xff\xfes", None])
-def test_a_broken_params_file_is_written_anew(text: bytes | None, tmp_path: Path) -> None:
+def test_a_broken_params_file_is_written_anew(tmp_path: Path) -> None:
     """Whatever stands there, by the command that the line of its refusal names; tests/chain has the lines."""
-    path = tmp_path / "params.yaml"
-    if text is not None:
-        path.write_bytes(text)
+    (path := tmp_path / "params.yaml").write_bytes(b"\xff\xfes")
     assert write_params(compose("smoke", conf=CONF), path)
     assert load_params(path) == compose("smoke", conf=CONF)
 
@@ -155,7 +149,6 @@ def test_any_folder_may_hold_the_videos(name: str, tmp_path: Path) -> None:
     ("arguments", "words"),
     [
         ("small data.source=videos data.dir=nowhere", "data.dir: nowhere does not exist"),
-        ("small data.source=videos data.dir=params.yaml", "data.dir: params.yaml is a file"),
         ("smoke runtime.launcher=acelerate", "runtime.launcher.*acelerate"),
         ("smoke questions.train={opd:true}", "questions.train.opd is True: .*valid integer"),
         ("smoke ablation.seeds=[true]", "ablation.seeds.0 is True: .*valid integer"),
@@ -165,7 +158,6 @@ def test_any_folder_may_hold_the_videos(name: str, tmp_path: Path) -> None:
         ("smoke scenes.objects=[unicorn]", "scenes.objects: unicorn"),
         ("smoke frames.pixels=48", "frames.pixels"),
         ("smoke cross_validation.folds=3", "cross_validation is no section any more; .*split.name=kfold"),
-        ("smoke frames.selection=uniform", "frames.selection is 'uniform': Input should be 'salient', 'release' or"),
     ],
 )
 def test_missing_inputs_are_named(arguments: str, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -244,7 +236,6 @@ def test_prune_keeps_what_params_name_and_removes_the_rest(tmp_path: Path) -> No
     ("text", "words"),
     [
         ("defaults: [small, _self_]\n", "it calls itself small, and would replace its reports; write scale: mine"),
-        ("defaults: [small\n", "scale mine: "),
         ("scale: mine\nscale: other\n", "scale mine: "),
         ("scale: größer\n".encode("latin-1"), "scale mine: "),
     ],

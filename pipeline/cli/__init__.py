@@ -71,12 +71,9 @@ def scale(
     params = compose(name, overrides or ())
     shapes = read_shapes(params)
     # First, since what a scale takes is asked before its weights are fetched.
-    memory = (
-        ["Memory in GiB on each device, counted from shapes:", table(uses)]
-        if (uses := [*count(params, shapes)])
-        else []
-    )
-    typer.echo("\n".join([*memory, *shapes.notes, *costs(params, shapes)]))
+    if uses := [*count(params, shapes)]:
+        typer.echo(f"Memory in GiB on each device, counted from shapes:\n{table(uses)}")
+    typer.echo("\n".join([*shapes.notes, *costs(params, shapes)]))
     if plan:
         typer.echo(f"{len(params.ablation.variants())} variants; nothing is written.")
         return

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from importlib.util import find_spec
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -109,46 +109,58 @@ def _loaded(source: Callable[[], Any]) -> Any:
 
 
 def _in_processes(work: Callable[[J], R], jobs: Sequence[J], label: str) -> Iterator[R]:
-    """In a process for each core, which does every so-manieth job, and has a pipe that closes where it dies.
+    """In a process for each core, each with a pipe of its own, which closes where it dies.
 
     Linux forks, since a fresh interpreter costs more than many whole videos; elsewhere the platform's way is used, and
     the caller's script needs a main guard.
     """
     context = multiprocessing.get_context("fork" if sys.platform == "linux" else None)
-    count, pipes, workers = min(cores(), len(jobs)), list[Connection](), list[Any]()
+    workers, found, taken = dict[Connection, Any](), dict[int, Any](), context.Value("q")
+    at: dict[Connection, int] = {}
     # Workers inherit the blocked SIGINT, so that on Ctrl-C only this process reacts, and ends them.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        for number in range(count):
+        for _ in range(min(cores(), len(jobs))):
             here, there = context.Pipe(duplex=False)
-            given = os.getpid(), work, jobs[number::count], there
-            worker: Any = context.Process(target=_take, args=given, daemon=True)
-            worker.start()
-            workers.append(worker)
-            pipes.append(here)
+            workers[here] = context.Process(target=_take, args=(os.getpid(), work, jobs, taken, there), daemon=True)
+            workers[here].start()
             there.close()
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        for number, job in enumerate(jobs):
-            try:
-                result, error = pipes[number % count].recv()
-            except (EOFError, OSError):
-                raise _died(label, job) from None
+        for number in range(len(jobs)):
+            while number not in found:
+                ready: Any = wait(workers)
+                for pipe in ready:
+                    try:
+                        said = pipe.recv()
+                    except (EOFError, OSError):
+                        raise _died(label, jobs[at.get(pipe, number)]) from None
+                    if isinstance(said, int):
+                        at[pipe] = said
+                    else:
+                        found[at[pipe]] = said
+            result, error = found.pop(number)
             if error is not None:
                 raise error
             yield result
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        for worker in workers:
+        for worker in workers.values():
             worker.kill()
+        for worker in workers.values():
             worker.join()
 
 
-def _take(parent: int, work: Callable[[J], R], jobs: Sequence[J], pipe: Connection) -> None:
-    """What a worker does: hand over each job's result, or its error."""
+def _take(parent: int, work: Callable[[J], R], jobs: Sequence[J], taken: Any, pipe: Connection) -> None:
+    """What a worker does until it is ended: take the next job, say its number, and hand over its result or error."""
     end_with_parent(parent)
-    for job in jobs:
+    while True:
+        with taken.get_lock():
+            number, taken.value = taken.value, taken.value + 1
+        if number >= len(jobs):
+            threading.Event().wait()
+        pipe.send(number)
         try:
-            pipe.send((work(job), None))
+            pipe.send((work(jobs[number]), None))
         except Exception as error:
             error.add_note(traceback.format_exc())  # Which does not travel.
             pipe.send((None, error))

@@ -226,7 +226,7 @@ def _main_process() -> bool:
 
 
 def _write_run(running: Stage) -> None:
-    """Write runs/NAME.json: times, seconds, device, most memory in MiB (a GPU's, if one was used), metrics, outputs."""
+    """Write runs/NAME.json: times, device, most memory in MiB (a GPU's, if one was used), metrics, outputs by hash."""
     import resource
 
     import psutil
@@ -246,14 +246,10 @@ def _write_run(running: Stage) -> None:
             "device": device,
             "peak_memory_mb": round(peak, 1),
             "metrics": running.metrics,
-            "outs": _outs(running),
+            # As dvc.lock will have them: other runs' have others.
+            "outs": {str(path): _md5(path) for path in _paths(running) if path.exists()},
         },
     )
-
-
-def _outs(running: Stage) -> dict[str, str]:
-    """Hashes of a stage's outputs by path, as dvc.lock will have them: other runs' have others."""
-    return {str(path): _md5(path) for path in _paths(running) if path.exists()}
 
 
 def _paths(running: Stage) -> list[Path]:

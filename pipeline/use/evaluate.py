@@ -27,8 +27,8 @@ from pipeline.videos.records import Video
 logger = logging.getLogger(__name__)
 
 BATCH = 64
-"""Answers of the shipped model in a batch; their keys and values take a gigabyte. Each step reads all weights once, however many answers
-share it."""
+"""Answers of the shipped model in a batch; their keys and values take a gigabyte. Each step reads all weights once,
+however many answers share it."""
 
 
 def answers_about(

@@ -13,6 +13,7 @@ from typing import Any, cast
 
 import pytest
 import torch
+from pipeline.use.shipped import answers_about
 from safetensors.torch import load_file
 from typer.testing import CliRunner
 
@@ -30,7 +31,6 @@ from pipeline.use import folder
 from pipeline.use.adapt import adapt
 from pipeline.use.folder import SHIPPED, Base, find_base, read_folder
 from pipeline.use.model import Octopi
-from pipeline.use.shipped import answers_about
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.records import Video
 from tests.checkpoints import edit
