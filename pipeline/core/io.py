@@ -33,7 +33,7 @@ R = TypeVar("R", bound=Record)
 ROOT = Path(__file__).parents[2]
 """Where the project lies: dvc.yaml, pipeline/, stages/."""
 REST = re.compile(r"\..+\.(\d{1,9})\.part(\.\w+)?")
-"""Name of an unfinished file or folder: the name it will have, and the number of the process that is writing it."""
+"""The name of an unfinished file or folder: `.NAME.PID.part`, of the process that is writing what will be NAME."""
 
 
 @contextmanager

@@ -170,7 +170,7 @@ def _dust(
 ) -> npt.NDArray[np.float32]:
     """Small dark grains, round or longish, each with its own place, size, direction and darkness."""
     dust = np.ones_like(x)
-    half = 9.3  # Half the view's width in mm; grains are small, so the other view's need not be told apart.
+    half = 9.3  # Half the width of the wide view in mm; for grains, the narrow one's is near enough.
     for _ in range(SPECKS):
         u, v = (x - rng.uniform(-1, 1)) * half, (y - rng.uniform(-1, 1)) * half * 0.75
         turn, size, longer = rng.uniform(0, np.pi), rng.uniform(*SPECK_MM), rng.choice((1.0, 1.0, 3.0))

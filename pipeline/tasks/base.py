@@ -127,8 +127,10 @@ class TaskDefinition(ABC):
         return {"choice": 1 / self.choices}
 
     def with_facts(self, draft: Draft, catalogue: Catalogue, rng: random.Random, inexact: float = 0.0) -> Draft:
-        """The question with facts about the objects that it names, each class in them with the probability `inexact` a
-        neighbour of the right one; unchanged if it names none."""
+        """The question with a fact about each object that it names; unchanged if it names none.
+
+        Each class in a fact is replaced by a neighbouring one with probability `inexact`.
+        """
         return draft
 
     def plainly(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
@@ -198,12 +200,12 @@ def single_turn(user: Mapping[Opd, str], answer: Mapping[Opd, str]) -> dict[Opd,
 def in_turns(draft: Draft, more: Sequence[Draft], catalogue: Catalogue) -> Draft:
     """Split a question into turns: the first asks for descriptions of all videos, the others for conclusions.
 
-    Unchanged are questions about one video, without the modes `all` and `none`, without a description, or that have
-    several turns already.
+    A question about one video is left as it is, and so is one that has no description, several turns already, or not
+    both of the modes `all` and `none`.
 
     Args:
-        more: Further questions about the same videos, each in its own turn. Descriptions are long, so several
-            conclusions share one.
+        more: Further questions about the same videos, a turn each: descriptions are long, so several conclusions
+            follow the same ones.
     """
     asked = {d.opd: d.turns for d in draft.dialogues}
     single = set(map(len, asked.values())) == {1} and asked.keys() >= {Opd.ALL, Opd.NONE}

@@ -22,20 +22,20 @@ FACT_DRAWS = 60
 
 
 def fact(catalogue: Catalogue, object_id: str, labels: Sequence[int] | None = None) -> str:
-    """What an object is like: "hard, smooth, no bumps is a ruler."; by these classes in place of its own, if given."""
+    """What an object is like, by `labels` or else its own classes: "hard, smooth, no bumps is a ruler."."""
     classes = zip(catalogue.properties, labels or catalogue.labels(object_id), strict=True)
     return sentence([p.levels[level] for p, level in classes], catalogue.objects[object_id].name)
 
 
 def sentence(classes: Iterable[str], name: str) -> str:
-    """A fact of any object."""
+    """A fact about an object of whichever catalogue."""
     return f"{', '.join(classes)} is {name}."
 
 
 def facts(catalogue: Catalogue, objects: Sequence[str], rng: random.Random, inexact: float = 0.0) -> str:
     """What each object is like, in random order.
 
-    With the chance `inexact` a class is a neighbour of the right one; the right matching stays nearer than any other.
+    Each class is replaced by a neighbouring one with probability `inexact`; the right matching still fits best.
     """
     right = [catalogue.labels(o) for o in objects]
     told = right

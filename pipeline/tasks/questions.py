@@ -69,12 +69,13 @@ def build_questions(
     nothing after `ATTEMPTS` draws are left out, and with `distinct` no question is asked twice.
 
     Args:
-        facts: The same questions as each task's `with_facts` makes them.
-        inexact: Chance that a fact's class is off by one.
-        restate: Answers as each task's `restated` has them.
-        two_turns: Share of the questions that are asked as `in_turns` does, with all others about the same videos.
-        plainly: Share of the others that become what their task's `plainly` makes.
-        fold: Part of the questions' ids, which makes them unique over all folds.
+        facts: Whether questions first state what the objects that they name are like (`TaskDefinition.with_facts`).
+        inexact: Probability that a class in such a fact is off by one.
+        restate: Whether answers repeat the classes asked for before they conclude (`TaskDefinition.restated`).
+        two_turns: Share of the questions about several videos that become a dialogue: descriptions first, then a turn
+            for each of the task's questions about these videos (`in_turns`).
+        plainly: Share of the other questions that are asked in everyday words (`TaskDefinition.plainly`).
+        fold: Its number stands in the questions' ids, so that they are unique over all folds.
     """
     place = str(pool.part) if fold is None else f"{pool.part}-fold{fold}"
     questions: list[Question] = []
@@ -130,8 +131,7 @@ def _drafts(
             for draft in (definition.draft(pool, stratum, rng) for _ in range(ATTEMPTS)):
                 if draft is None:
                     continue
-                # Another template or text does not make a new question about the same videos and properties; another
-                # scenario does.
+                # The same videos and properties in other words are no new question; under another scenario they are.
                 last = draft.dialogues[-1].turns[-1]
                 situation = last.user if "{tactile}" not in last.user else ""
                 key = (draft.videos, draft.gold, situation)

@@ -94,8 +94,12 @@ def answers_about(
         if octopi.config.heads:
             scored[Shown.CLASSES] = conclude(questions, classified, catalogue)
         for shown, scores in scored.items():
-            whose = {"model": octopi.name, "shown": shown, "seed": params.ablation.seeds[0] + repeat}
-            found += [GradedVision(**score.model_dump(), **whose) for score in scores]
+            found += [
+                GradedVision(
+                    **score.model_dump(), model=octopi.name, shown=shown, seed=params.ablation.seeds[0] + repeat
+                )
+                for score in scores
+            ]
     return found
 
 

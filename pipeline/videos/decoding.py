@@ -177,7 +177,7 @@ def upright(image: Image, frame: av.VideoFrame) -> Image:
 
 def turns(frame: av.VideoFrame) -> int:
     """Counterclockwise quarter turns that the metadata ask for, after mirroring."""
-    # FFmpeg tells where the right side goes, which a mirror makes the left one.
+    # FFmpeg's angle is that of the picture's right side. Mirroring puts the left side there, which is half a turn more.
     return round(frame.rotation / 90 + 2 * _mirrors(frame)) % 4
 
 

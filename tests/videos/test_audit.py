@@ -57,12 +57,6 @@ def test_every_broken_file_is_found_and_raises_nothing(tmp_path: Path, catalogue
     assert {e for e in errors if e[0] in ("name", "decodes")} <= checked
 
 
-def test_a_split_that_is_not_there_is_an_error_beside_the_others(tmp_path: Path, catalogue: Catalogue) -> None:
-    write_video(tmp_path / "rug_0.avi", moving_square(3))
-    findings = audit_folder(tmp_path, catalogue, SplitConfig(name="nonsense"))
-    assert [(f.check, f.item) for f in findings if f.severity is ERROR] == [("split", "nonsense")]
-
-
 def test_no_folder_or_an_empty_one_is_an_error_beside_the_labels(tmp_path: Path, catalogue: Catalogue) -> None:
     for folder in (tmp_path, tmp_path / "none"):
         findings = audit_folder(folder, catalogue, PAPER)

@@ -1,4 +1,4 @@
-"""The no-contact reference, the strength of contact, and pictures of the difference, against float64."""
+"""The no-contact reference, how strongly a frame differs from it, and light that warms up or changes."""
 
 from __future__ import annotations
 
@@ -7,17 +7,13 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from pipeline.config import FramesConfig
 from pipeline.use.frames import read_touch
 from pipeline.videos.decoding import Decoder, fit, planes
 from pipeline.videos.frames.reference import reference_indices, thumbnail
-from pipeline.videos.frames.subtraction import subtract
 from tests.conftest import encode, write_video
 from tests.frame_rules import Scanned, frames_of, scanned
-from tests.numerics.test_frames import subtracted
 
 WIDTH, HEIGHT = 120, 90
 
@@ -152,13 +148,3 @@ def test_thumbnails_keep_the_shape(tmp_path: Path, height: int, width: int) -> N
     rows, columns = (max(1, round(80 * min(1, share))) for share in (height / width, width / height))
     assert thumb.shape == (rows, columns, 3)
     assert (thumb[..., 0] == planes(frame)[0][0, 0]).all()
-
-
-@given(st.tuples(*[st.integers(1, 20)] * 2), st.integers(0, 2**32), st.sampled_from([3, 40, 256]))
-def test_subtraction_equals_the_float64_one(size: tuple[int, int], seed: int, values: int) -> None:
-    pictures = np.random.default_rng(seed).integers(0, values, (3, *size, 3), np.uint16).astype(np.uint8)
-    found = subtract(pictures[:2], pictures[2])
-    assert (found.dtype, found.shape) == (np.uint8, pictures[:2].shape)
-    for frame, shown in zip(pictures[:2], found, strict=True):
-        np.testing.assert_array_equal(shown, subtracted(frame - pictures[2].astype(np.float64)))
-    assert subtract(pictures[:0], pictures[2]).shape == pictures[:0].shape

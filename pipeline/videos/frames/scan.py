@@ -64,7 +64,7 @@ class Plan:
     start: int
     """The first whose contact is measured."""
     begin: int = 0
-    """First frames to skip; only the published rule, which has no check of the light, may keep them."""
+    """Number of first frames to skip. Only the published rule, which does not look at the light, may keep some."""
 
 
 @dataclass(frozen=True)

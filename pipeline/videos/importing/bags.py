@@ -73,7 +73,8 @@ def shots(bag: Path, topic: str) -> Iterator[Shot]:
 def _mixed(times: Sequence[tuple[int, int]]) -> bool:
     """Whether the clock that a bag is sorted by was set back, by arrivals and stamps in ns.
 
-    Stamps then fall often, or once across a gap; if the camera's own clock was set, once between even arrivals.
+    Stamps then fall several times, or once where arrivals have a gap. A single fall between even arrivals means only
+    that the camera's own clock was set.
     """
     waits, steps = np.diff(np.array(times), axis=0).T
     fell = steps < -2 * np.median(np.diff(np.sort([stamp for _, stamp in times])))
@@ -87,7 +88,7 @@ def _picture(message: Any, where: str) -> Image:
         decoded = read_picture(data, where)
         if decoded is None:
             raise UserError(f"{where} is no picture that OpenCV reads (format {message.format!r}); send jpeg or png")
-        # That encoder was handed red first and takes blue first.
+        # Red-first pixels went into an encoder that takes blue first: they are swapped back.
         return np.ascontiguousarray(decoded[:, :, ::-1]) if "compressed rgb" in message.format else decoded
     height, width, step = message.height, message.width, message.step
     size, way = ENCODINGS.get(message.encoding, (0, None))
