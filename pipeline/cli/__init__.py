@@ -257,9 +257,6 @@ def answer_with(
     ] = None,
     temperature: Annotated[float, typer.Option(min=0, help="1 for models that take no other.")] = 0.0,
     max_tokens: Annotated[int, typer.Option(min=1, help="Of a reply.")] = 1024,
-    prompt: Annotated[
-        Literal["own", "published"], typer.Option(help="published: the paper's three, which only ask for classes.")
-    ] = "own",
 ) -> None:
     """Let a model behind an endpoint answer the evaluation questions about pictures; OPENAI_API_KEY holds its key."""
     from pipeline.config.params import load_params
@@ -269,8 +266,8 @@ def answer_with(
     if folder is None and shown == "photos":
         raise UserError("DIR: name the folder with photos, as in `--input photos DIR`")
     settings = {"model": model, "temperature": temperature, "max_completion_tokens": max_tokens}
-    place, published = folder or Path("data/frames"), prompt == "published"
-    typer.echo(ask_all(load_params(), endpoint.rstrip("/"), settings, Shown(shown), place, published=published))
+    place = folder or Path("data/frames")
+    typer.echo(ask_all(load_params(), endpoint.rstrip("/"), settings, Shown(shown), place))
 
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})

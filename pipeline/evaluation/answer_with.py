@@ -1,8 +1,8 @@
 """Ask a vision-language model behind an OpenAI-compatible endpoint the evaluation questions.
 
 In place of tactile videos it gets pictures. The paper compares with such a model, PG-InstructBLIP (Gao et al. 2024,
-arXiv:2309.02561). Answers are written to `external/`, which the stages `grade` and `report` read: no stage asks a
-network.
+arXiv:2309.02561), which it asks for classes alone. Answers are written to `external/`, which the stages `grade` and
+`report` read: no stage asks a network.
 """
 
 from __future__ import annotations
@@ -50,17 +50,6 @@ KINDS = {
     "a soft gel films how an object presses into the gel.",
     Shown.PHOTOS: "In place of each tactile video you see photos of the object that was touched in it.",
 }
-PUBLISHED = {
-    "hardness": ("hard, soft or medium", {"soft": 0, "medium": 1, "hard": 2}),
-    "roughness": ("rough, smooth or medium", {"smooth": 0, "medium": 1, "rough": 2}),
-    "bumpiness": ("having big bumps, small bumps or no bumps", {"no bumps": 0, "small bumps": 1, "big bumps": 2}),
-}
-"""How the paper asks PG-InstructBLIP, which never said "moderately hard" or "slightly rough": what it chooses from, and
-the class of each (its appendix on PG-InstructBLIP's property prediction)."""
-PROMPTS = [
-    f"{{tactile}}Classify the object as {choices}? Respond unknown if you are not sure. Short answer:"
-    for choices, _ in PUBLISHED.values()
-]
 
 
 class Reply(Record):
@@ -77,9 +66,7 @@ class Reply(Record):
     day: str = Field(default_factory=lambda: datetime.now(UTC).date().isoformat())
 
 
-def ask_all(
-    params: Params, url: str, settings: Mapping[str, Any], shown: Shown, folder: Path, *, published: bool = False
-) -> str:
+def ask_all(params: Params, url: str, settings: Mapping[str, Any], shown: Shown, folder: Path) -> str:
     """Ask what is not in the cache yet, and write the answers to `external/<report>/<model>-<shown>/`.
 
     Each reply is in the cache before the next request leaves, so a run that ended goes on where it was. The chain must
@@ -89,22 +76,18 @@ def ask_all(
         url: Of the endpoint, up to and with the `/v1` that most have.
         settings: What a request has beside its messages: `model`, `temperature` and `max_completion_tokens`.
         folder: Of the kept frames, or of the photos: for each object `<object>.jpg` or a folder `<object>/`.
-        published: Only describe, by the paper's three prompts, from one photo a video where photos are shown.
 
     Raises:
-        UserError: where the prompts are about other properties, an input is missing, or the endpoint fails.
+        UserError: where an input is missing, or the endpoint fails.
     """
     if re.search("[@?]", url):
         raise UserError("--endpoint: the URL is written beside the answers; put a key into OPENAI_API_KEY instead")
-    name = re.sub(r"[^\w.-]+", "-", f"{settings['model']}-{shown}{'-published' if published else ''}")
+    name = re.sub(r"[^\w.-]+", "-", f"{settings['model']}-{shown}")
     place = EXTERNAL / params.report_name / name
     files = {seed: questions_file(seed) for seed in params.ablation.seeds}
     catalogue = load_catalogue(Path(params.data.catalogue)).called(params.questions.names)
-    if published and [(p.name, len(p.levels)) for p in catalogue.properties] != [(n, 3) for n in PUBLISHED]:
-        raise UserError(f"--prompt published: is about {', '.join(PUBLISHED)} alone, of three classes; leave it out")
     with alone(f"answer-with@{name}"):
-        every = [(s, q) for s, f in files.items() for q in read_jsonl(f, Question) if q.task == "OPD" or not published]
-        most = 1 if published and shown is Shown.PHOTOS else params.frames.per_video
+        every, most = [(s, q) for s, f in files.items() for q in read_jsonl(f, Question)], params.frames.per_video
         show = _frames(folder, most) if shown is Shown.FRAMES else _photos(folder, [q for _, q in every], most)
         training = {seed: read_jsonl(questions_file(seed, "train"), Question) for seed in files}
         told = {(s, t): instruction(catalogue, shown, training[s], t) for s in files for t in TASKS}
@@ -112,14 +95,10 @@ def ask_all(
         answers: dict[int, list[Prediction]] = {seed: [] for seed in files}
         used: dict[str, Reply] = {}
         for seed, question in track(every, name, "question"):
-            if published:
-                replies = [r for prompt in PROMPTS for r in _converse([prompt], question.videos, asker, show)]
-                outputs = [_description(replies, catalogue)]
-            else:
-                # As the full system is asked; every task has this mode.
-                turns = [turn.user for turn in next(d for d in question.dialogues if d.opd is Opd.ALL).turns]
-                replies = _converse([told[seed, question.task] + turns[0], *turns[1:]], question.videos, asker, show)
-                outputs = [r.text for r in replies] + [""] * (len(turns) - len(replies))
+            # As the full system is asked; every task has this mode.
+            turns = [turn.user for turn in next(d for d in question.dialogues if d.opd is Opd.ALL).turns]
+            replies = _converse([told[seed, question.task] + turns[0], *turns[1:]], question.videos, asker, show)
+            outputs = [r.text for r in replies] + [""] * (len(turns) - len(replies))
             used |= {reply.request: reply for reply in replies}
             cut, tokens = any(r.ended == "length" for r in replies), sum(r.tokens for r in replies)
             whose = {"question_id": question.question_id, "task": question.task}
@@ -129,7 +108,7 @@ def ask_all(
         days = sorted(reply.day for reply in used.values()) or [""]
         ended = Counter(sorted(reply.ended for reply in used.values()))
         source = VisionModel(
-            model=settings["model"] + (", published prompts" if published else ""),
+            model=settings["model"],
             served_as=tuple(sorted({reply.model for reply in used.values()})),
             endpoint=url,
             temperature=settings["temperature"],
@@ -140,7 +119,6 @@ def ask_all(
             shown=shown,
             per_video=most,
             questions={str(seed): fingerprint(file) for seed, file in files.items()},
-            published=published,
             folder=str(folder),
             frames=frames_key(folder) if shown is Shown.FRAMES else "",
         )
@@ -192,16 +170,6 @@ def _converse(turns: Sequence[str], videos: Sequence[str], asker: _Asker, show: 
             break
         messages.append({"role": "assistant", "content": replies[-1].text})
     return replies
-
-
-def _description(replies: Sequence[Reply], catalogue: Catalogue) -> str:
-    """The classes that replies to `PROMPTS` name, as a description; who names none or two has chosen none."""
-    told = {}
-    for prop, reply in zip(catalogue.properties, replies, strict=True):
-        classes = PUBLISHED[prop.name][1].items()
-        named = [level for words, level in classes if re.search(rf"\b{words}\b", reply.text.lower())]
-        told[prop.name] = prop.levels[named[0]] if len(named) == 1 else "unknown"
-    return catalogue.language.structured.format(**told)
 
 
 class _Asker:
@@ -268,8 +236,7 @@ def _frames(folder: Path, most: int) -> Show:
 
 
 def _photos(folder: Path, questions: Sequence[Question], most: int) -> Show:
-    """Photos of the object that was touched in a video, with no camera's metadata; with `most` 1, each of its videos
-    gets the next one."""
+    """Photos of the object that was touched in a video."""
     touched = {v: o for q in questions for v, o in zip(q.videos, q.objects, strict=True)}
     found: dict[str, list[Path]] = {}
     for name in sorted({*touched.values()}):
@@ -281,10 +248,8 @@ def _photos(folder: Path, questions: Sequence[Question], most: int) -> Show:
             raise UserError(f"{folder}: no photo of {name}; put {name}.jpg or a folder {name}/ there ({kinds})")
 
     def show(video_id: str) -> list[dict[str, Any]]:
-        files, own = found[touched[video_id]], sorted(v for v, o in touched.items() if o == touched[video_id])
-        places = sorted({*sample_evaluation(len(files), most)}) if most > 1 else [own.index(video_id) % len(files)]
-        pictures = []
-        for file in (files[i] for i in places):
+        files, pictures = found[touched[video_id]], []
+        for file in (files[i] for i in sorted({*sample_evaluation(len(files), most)})):
             if (photo := cv2.imread(str(file))) is None:  # Upright, as its camera was held.
                 raise UserError(f"{file}: not a picture that can be read; replace it")
             scale = min(1.0, LONGEST / max(photo.shape[:2]))

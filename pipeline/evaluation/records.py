@@ -69,7 +69,7 @@ class VisionModel(Record):
     questions: dict[str, str]
     """By seed, the fingerprint of the file of questions that it answered."""
     published: bool = False
-    """Whether it was asked the paper's three prompts alone; else as the full system is, with classes and examples."""
+    """Whether an earlier version asked it the paper's three prompts alone; else it is asked as the full system is."""
     folder: str = ""
     """Where its pictures lay."""
     frames: str = ""

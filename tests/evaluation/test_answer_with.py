@@ -196,24 +196,6 @@ def test_examples_are_the_first_of_each_answer_and_at_most_three(endpoint: Endpo
         assert "{tactile}" not in text
 
 
-def test_published_prompts_ask_for_one_class_a_property(endpoint: Endpoint, catalogue: Catalogue) -> None:
-    # Medium is the middle class; who does not know, or names two, has told no class.
-    told = ["Medium.", "smooth", "unknown", "It is hard", "rough or smooth", "no bumps"]
-    endpoint.step = lambda n: reply(told[n % 6])
-    assert "2 questions answered by 6 requests" in run("--prompt", "published")
-    texts = [shown_in(body["messages"][0]["content"])[0] for body in endpoint.bodies]
-    choices = ("hard, soft or medium", "rough, smooth or medium", "having big bumps, small bumps or no bumps")
-    told_of = "{tactile}Classify the object as %s? Respond unknown if you are not sure. Short answer:"
-    assert texts == [told_of % classes for classes in choices] * 2
-    scores = {(s.question_id, s.measure): s for s in graded()}
-    assert {s.model for s in scores.values()} == {"some-maker/sees-1, published prompts"}
-    described = [q for q in asked() if q.task == "OPD"]
-    for question, classes in zip(described, ((1, 0, None), (2, None, 0)), strict=True):
-        for p, known, said in zip(catalogue.properties, catalogue.labels(question.objects[0]), classes, strict=True):
-            score = scores[question.question_id, p.name]
-            assert (score.parsed, score.correct) == (said is not None, said == known)
-
-
 FAILURES = {
     "key": (httpx2.Response(401, json={"error": {"message": f"Incorrect key: {KEY}"}}), r"401.*Incorrect key: \[key\]"),
     "a page": (httpx2.Response(200, html="<html>\n<p>Welcome"), "Welcome.*URL"),
@@ -302,18 +284,7 @@ def test_photos_stand_in_place_of_the_videos_of_their_objects(photos: Path, endp
     assert all(s.shown is Shown.PHOTOS and s.correct for s in graded())
 
 
-def test_the_published_prompts_show_each_sample_a_photo_of_its_own(photos: Path, endpoint: Endpoint) -> None:
-    """Of the first object there are seven photos, which differ in height."""
-    one, name = next(q for q in asked() if q.task == "OPD"), min(o for q in asked() for o in q.objects)
-    order = (4, 0, 1, 2, 6, 5, 3)
-    of_one = [{"question_id": str(n), "videos": (f"{name}_{n}",), "objects": (name,)} for n in order]
-    write_jsonl(Path("data/questions/0/evaluation.jsonl"), [one.model_copy(update=own) for own in of_one])
-    run(str(photos), "--prompt", "published", shown="photos")
-    pictures = [shown_in(body["messages"][0]["content"])[1] for body in endpoint.bodies[::3]]
-    assert [[p.height - 8 for p in found] for (found,) in pictures] == [[n] for n in order]
-
-
-def test_bad_inputs(photos: Path, endpoint: Endpoint, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bad_inputs(photos: Path, endpoint: Endpoint) -> None:
     """Each is one line that names the file or the option, and asks nothing."""
     name = sorted({o for q in asked() for o in q.objects})[1]
     (photos / f"{name}.JPG").write_bytes(b"no picture")
@@ -327,9 +298,6 @@ def test_bad_inputs(photos: Path, endpoint: Endpoint, catalogue: Catalogue, monk
     np.save("other/frames.npy", np.zeros((0, 16, 16, 3), np.uint8))
     assert "no frame of" in run("other", refused=True)
     assert "OPENAI_API_KEY" in run(refused=True, url=f"https://example.org/v1?key={KEY}")
-    other = catalogue.model_copy(update={"properties": catalogue.properties[:2]})
-    monkeypatch.setattr("pipeline.evaluation.answer_with.load_catalogue", lambda _: other)
-    assert "--prompt published: is about hardness" in run("--prompt", "published", refused=True)
     assert len(endpoint.bodies) == before
 
 
