@@ -19,8 +19,8 @@ import numpy as np
 
 from benchmarks.table import Row, machine, make_rows, timed
 from pipeline.config.params import load_params
+from pipeline.core.layout import SHIPPED
 from pipeline.running.errors import UserError
-from pipeline.use.folder import SHIPPED
 from pipeline.videos.files import video_files
 
 QUESTION = "Describe the touch. {tactile}"

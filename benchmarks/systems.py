@@ -11,10 +11,10 @@ import torch
 from benchmarks.table import Error, Row, machine, make_rows, timed
 from pipeline.config.params import load_params
 from pipeline.core.io import read_csv
+from pipeline.core.layout import SHIPPED
 from pipeline.evaluation.records import Shown
 from pipeline.evaluation.rows import ScoreRow
 from pipeline.running.errors import UserError
-from pipeline.use.folder import SHIPPED
 from pipeline.use.model import Octopi
 from pipeline.videos.files import video_files
 

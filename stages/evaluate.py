@@ -3,7 +3,7 @@
 from collections import Counter
 
 from pipeline.core.io import read_table, write_table
-from pipeline.core.layout import EVALUATED, VIDEOS, split_file
+from pipeline.core.layout import EVALUATED, SHIPPED, VIDEOS, split_file
 from pipeline.core.runtime import limit_threads
 from pipeline.evaluation.records import GradedVision, Shown
 from pipeline.running.errors import UserError
@@ -13,10 +13,12 @@ from pipeline.videos.records import Assignment, Video
 if __name__ == "__main__":
     with stage("evaluate") as run:
         from pipeline.use.evaluate import answers_about
-        from pipeline.use.folder import SHIPPED
         from pipeline.use.model import Octopi
 
         params, graded = run.params, list[GradedVision]()
+        several = [name for name, count in Counter(params.evaluate.models).items() if count > 1]
+        if several:
+            raise UserError(f"evaluate.models names {several[0]} twice; name each once")
         if params.evaluate.models:
             # As many on every machine, since sums depend on how they are shared out.
             limit_threads(2)
@@ -28,9 +30,6 @@ if __name__ == "__main__":
             # Half precision on one processor and not on another would make the report depend on the machine.
             octopi = Octopi.from_pretrained(place, device=params.runtime.device, dtype=params.language.dtype)
             graded += answers_about(octopi, params, read_table(VIDEOS, Video), parts)
-        several = [name for name, count in Counter(map(str, params.evaluate.models)).items() if count > 1]
-        if several:
-            raise UserError(f"evaluate.models names {several[0]} twice; name each once")
         run.metrics["answers"] = len(
             {(g.model, g.shown, g.question_id) for g in graded if g.shown is not Shown.CLASSES}
         )

@@ -34,7 +34,7 @@ REDUCED = (
     "align.train_embeddings=all",
     "lora.samples=16",
     "language.max_new_tokens=24",
-    "shipped=0",
+    "evaluate.models=[]",
 )
 
 

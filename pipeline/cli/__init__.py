@@ -37,6 +37,8 @@ data_app = typer.Typer(help="Look at a folder of tactile videos.", no_args_is_he
 app.add_typer(data_app, name="data")
 import_app = typer.Typer(help="Make videos of other recordings.", no_args_is_help=True)
 app.add_typer(import_app, name="import")
+questions_app = typer.Typer(help="Let any other model answer the run's questions.", no_args_is_help=True)
+app.add_typer(questions_app, name="questions")
 
 
 @app.callback(invoke_without_command=True)
@@ -268,6 +270,27 @@ def answer_with(
     settings = {"model": model, "temperature": temperature, "max_completion_tokens": max_tokens}
     place = folder or Path("data/frames")
     typer.echo(ask_all(load_params(), endpoint.rstrip("/"), settings, Shown(shown), place))
+
+
+@questions_app.command("export")
+def export_questions(file: Annotated[Path, typer.Argument(help="JSON lines: id, task, turns, videos.")]) -> None:
+    """Write the evaluation questions for a model of your own; file names name objects, so do not show them to it."""
+    from pipeline.config.params import load_params
+    from pipeline.evaluation.outside import export
+
+    typer.echo(export(load_params(), file))
+
+
+@questions_app.command("grade")
+def grade_answers(
+    file: Annotated[Path, typer.Argument(help="JSON lines: id, and text (a list of texts for several turns).")],
+    name: Annotated[str, typer.Option(help="What tables call the model.")],
+) -> None:
+    """Put a model's answers beside the others in the report, which `dvc repro` writes."""
+    from pipeline.config.params import load_params
+    from pipeline.evaluation.outside import take
+
+    typer.echo(take(load_params(), file, name))
 
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
@@ -520,7 +543,7 @@ def serve(
     places: Annotated[int, typer.Option(min=1, help="Requests at once; the next is told to come later.")] = 32,
 ) -> None:
     """Answer questions about touches over HTTP, in the form of OpenAI's chat completions."""
-    from pipeline.use.folder import SHIPPED
+    from pipeline.core.layout import SHIPPED
     from pipeline.use.serve import serve
 
     serve(lambda: _load(folder, base, device), (folder or SHIPPED).resolve().name, host, port, token_file, places)

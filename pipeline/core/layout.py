@@ -7,6 +7,8 @@ from pipeline.core.records import Encoder, Variant
 DATA, RUNS, REPORTS, MODELS = Path("data"), Path("runs"), Path("reports"), Path("models")
 CHECKPOINTS = Path("checkpoints")
 """Where unfinished work waits to be resumed, outside DVC's reach: DVC deletes the outputs of a killed stage."""
+SHIPPED = Path(__file__).parents[1] / "pretrained" / "octopi-small"
+"""The model that is part of the package."""
 EXTERNAL = Path("external")
 """What models behind endpoints answered, by report and model: an input of the chain, where no stage asks a network."""
 INVENTED = DATA / "invented"

@@ -22,10 +22,10 @@ import cv2
 from pydantic import Field
 
 from pipeline.config import Params
-from pipeline.core.io import fingerprint, read_jsonl, write_json, write_jsonl
+from pipeline.core.io import read_jsonl
 from pipeline.core.layout import EXTERNAL, questions_file
 from pipeline.core.records import Opd, Prediction, Question, Record
-from pipeline.evaluation.grading import SOURCE_FILE
+from pipeline.evaluation.outside import asked, record, turns_of
 from pipeline.evaluation.records import Shown, VisionModel
 from pipeline.running.errors import UserError
 from pipeline.running.progress import track
@@ -84,27 +84,24 @@ def ask_all(params: Params, url: str, settings: Mapping[str, Any], shown: Shown,
         raise UserError("--endpoint: the URL is written beside the answers; put a key into OPENAI_API_KEY instead")
     name = re.sub(r"[^\w.-]+", "-", f"{settings['model']}-{shown}")
     place = EXTERNAL / params.report_name / name
-    files = {seed: questions_file(seed) for seed in params.ablation.seeds}
     catalogue = load_catalogue(Path(params.data.catalogue)).called(params.questions.names)
     with alone(f"answer-with@{name}"):
-        every, most = [(s, q) for s, f in files.items() for q in read_jsonl(f, Question)], params.frames.per_video
+        questions, most = asked(params), params.frames.per_video
+        every = [(seed, question) for seed, own in questions.items() for question in own]
         show = _frames(folder, most) if shown is Shown.FRAMES else _photos(folder, [q for _, q in every], most)
-        training = {seed: read_jsonl(questions_file(seed, "train"), Question) for seed in files}
-        told = {(s, t): instruction(catalogue, shown, training[s], t) for s in files for t in TASKS}
+        training = {seed: read_jsonl(questions_file(seed, "train"), Question) for seed in questions}
+        told = {(s, t): instruction(catalogue, shown, training[s], t) for s in questions for t in TASKS}
         asker = _Asker(url, settings, place / "cache.jsonl")
-        answers: dict[int, list[Prediction]] = {seed: [] for seed in files}
+        answers: dict[int, list[Prediction]] = {seed: [] for seed in questions}
         used: dict[str, Reply] = {}
         for seed, question in track(every, name, "question"):
-            # As the full system is asked; every task has this mode.
-            turns = [turn.user for turn in next(d for d in question.dialogues if d.opd is Opd.ALL).turns]
+            turns = turns_of(question)
             replies = _converse([told[seed, question.task] + turns[0], *turns[1:]], question.videos, asker, show)
             outputs = [r.text for r in replies] + [""] * (len(turns) - len(replies))
             used |= {reply.request: reply for reply in replies}
             cut, tokens = any(r.ended == "length" for r in replies), sum(r.tokens for r in replies)
             whose = {"question_id": question.question_id, "task": question.task}
             answers[seed].append(Prediction(**whose, outputs=tuple(outputs), truncated=cut, tokens=tokens))
-        for seed, predictions in answers.items():
-            write_jsonl(place / f"{seed}.jsonl", predictions)
         days = sorted(reply.day for reply in used.values()) or [""]
         ended = Counter(sorted(reply.ended for reply in used.values()))
         source = VisionModel(
@@ -118,12 +115,10 @@ def ask_all(params: Params, url: str, settings: Mapping[str, Any], shown: Shown,
             ended=ended,
             shown=shown,
             per_video=most,
-            questions={str(seed): fingerprint(file) for seed, file in files.items()},
             folder=str(folder),
             frames=frames_key(folder) if shown is Shown.FRAMES else "",
         )
-        # Written last, since this file vouches that the answers beside it belong to these questions.
-        write_json(place / SOURCE_FILE, source.model_dump(mode="json"))
+        record(params, name, source, answers)
     how, sent = ", ".join(f"{count} {kind}" for kind, count in ended.items()), len(asker.known) - asker.before
     return f"{place}: {len(every)} questions answered by {sent} requests ({how}); `dvc repro` grades them"
 

@@ -21,10 +21,12 @@ class Shown(StrEnum):
     """The kept frames of the question's videos."""
     PHOTOS = "photos"
     """Photos of the question's objects."""
+    OUTSIDE = "answers from outside"
+    """Whatever others showed it of the question's videos."""
     TOUCH = "touch"
-    """The run's tactile videos; only the shipped model is asked this way."""
+    """The run's tactile videos; the models of `evaluate.models` are asked this way."""
     CLASSES = "classes"
-    """The classes that the shipped model's property heads predict; rules answer from them, without a language model."""
+    """The classes that such a model's property heads predict; rules answer from them, without a language model."""
     STANDARDISED = "touch, standardised"
     """As `TOUCH`, with embeddings standardised over the run's videos (without labels)."""
 
@@ -48,25 +50,29 @@ class Graded(Score):
 
 
 class VisionModel(Record):
-    """A model behind an endpoint that answered about pictures, and how it was asked: a source.json."""
+    """A model that this project does not run and how it was asked: a source.json.
+
+    It stands behind an endpoint and answered about pictures; or its answers came in a file, of which only the name and
+    the day are known.
+    """
 
     model: str
     """As it was asked for."""
-    served_as: tuple[str, ...]
+    served_as: tuple[str, ...] = ()
     """What the endpoint called it."""
-    endpoint: str
+    endpoint: str = ""
     shown: Shown
-    per_video: int
+    per_video: int = 0
     """Most pictures in place of a video."""
-    temperature: float
-    max_tokens: int
+    temperature: float = 0.0
+    max_tokens: int = 0
     first: str
     """Day of the first reply, and of the last; UTC."""
     last: str
-    ended: dict[str, int]
+    ended: dict[str, int] = {}  # noqa: RUF012
     """How many replies ended with `stop`, `length`, `content_filter`, `refusal`, `nothing` (no text), `unsaid`, or
     another word of the endpoint's."""
-    questions: dict[str, str]
+    questions: dict[str, str] = {}  # noqa: RUF012
     """By seed, the fingerprint of the file of questions that it answered."""
     published: bool = False
     """Whether an earlier version asked it the paper's three prompts alone; else it is asked as the full system is."""

@@ -133,11 +133,16 @@ def difference(one: Runs, other: Runs) -> Difference | None:
 
 
 def _rows(runs: Runs, *, chance: float, **named: str) -> list[ScoreRow]:
-    """A row a seed, and the last over all seeds, on the questions that all of them have answered."""
+    """A row a seed, and the last over all seeds, on the questions that all of them have answered.
+
+    Where seeds are sets of different questions (`evaluate.repeats`), the last is on all of them.
+    """
     # By seed, the answers to each question.
     given = {str(seed): [[a] for a in answers.values()] for seed, answers in sorted(runs.items())}
     if asked := _shared(runs.values()):
         given[ALL_SEEDS] = [[answers[q] for answers in runs.values()] for q in asked]
+    else:
+        given[ALL_SEEDS] = [questions for own in given.values() for questions in own]
     rows = []
     for seed, questions in given.items():
         right = [fmean(a.correct for a in answers) for answers in questions]

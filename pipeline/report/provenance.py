@@ -16,6 +16,7 @@ import yaml
 from pipeline.config import EncoderConfig, Params
 from pipeline.config.params import CONF, PARAMS_FILE, compose
 from pipeline.core.io import ROOT, code_of, sha256, tensor_shapes
+from pipeline.core.layout import SHIPPED
 from pipeline.core.records import Part
 from pipeline.evaluation.intervals import coverage_note
 from pipeline.training.card import front_matter
@@ -61,7 +62,9 @@ def provenance(
     rows = "\n".join(video.model_dump_json() for video in videos)
     test = {a.video_id: a.object_id for assignments in splits for a in assignments if a.part is Part.TEST}
     seeds, split = params.ablation.seeds, params.split
-    based = ("encoder", "language") if reads_weights(params.encoder) else ("language",)
+    based: tuple[str, ...] = ("encoder", "language") if reads_weights(params.encoder) else ("language",)
+    if not params.ablation.train:
+        based = ()
     folds = sorted({fold for seed in seeds if (fold := split.fold_of(seed)) is not None})
     notes: dict[str, str] = yaml.safe_load(NOTES.read_text(encoding="utf-8")).get(catalogue.language.dataset, {})
     return {
@@ -81,19 +84,32 @@ def provenance(
         "settings": notes.get(f"{params.report_name}/{split.name}", notes.get(split.name, "")),
         "intervals": coverage_note(asked),
         "facts_told": params.questions.facts,
-        "beyond_paper": beyond_paper(params, root / CONF),
+        "beyond_paper": beyond_paper(params, root / CONF) if based else {},
+        "evaluated": evaluated(params.evaluate.models),
         "command": "dvc repro",
         # Not the commit, which names itself no file that it holds; runs in MLflow have it.
         "code_sha256": hash_of(code_of("report")),
         "params_sha256": sha256(root / PARAMS_FILE),
         "data_sha256": hashlib.sha256(rows.encode()).hexdigest(),
-        "encoder": encoder_words(params.encoder),
+        "encoder": encoder_words(params.encoder) if based else "",
         "base_models": {part: base_model(root, getattr(params, part).weights) for part in based},
         # In words, those of the base encoder's backbones that the chain pretrains itself.
-        "own_backbones": [BACKBONES[b].words for b in params.encoder.backbone if BACKBONES[b].key != "weights"],
+        "own_backbones": [BACKBONES[b].words for b in params.encoder.backbone if based and not reads(b)],
         "python": ".".join(platform.python_version_tuple()[:2]),
         "packages": {name: metadata.version(name) for name in PACKAGES},
     }
+
+
+def reads(backbone: str) -> bool:
+    """Whether a backbone reads `encoder.weights`."""
+    return BACKBONES[backbone].key == "weights"
+
+
+def evaluated(models: Sequence[str]) -> list[dict[str, str]]:
+    """The models of `evaluate.models`: folder, and the hash of config.json, which has those of all other files."""
+    places = {model: SHIPPED if model == SHIPPED.name else Path(model) for model in models}
+    configs = {model: place / "config.json" for model, place in places.items()}
+    return [{"folder": named(m), "sha256": sha256(c) if c.is_file() else "unknown"} for m, c in configs.items()]
 
 
 def beyond_paper(params: Params, conf: Path) -> dict[str, Any]:

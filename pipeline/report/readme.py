@@ -17,6 +17,7 @@ PLUMBING = "The chain's own models at this scale are random ones: a test of the 
 ALPHA = 0.05
 VICUNA = 5e9
 """Parameters below which a language model is no Vicuna 7b."""
+OTHER_QUESTIONS = "Published figures are the paper's, from its own questions about its own test objects."
 OTHER_MODELS = (
     "Published figures are the paper's, of Octopi with Vicuna 7b and 13b (and of CLIP ViT-L/14 where no language model "
     "answers): other models on other questions about other objects. They are no target that was met or missed."
@@ -34,14 +35,17 @@ def sections(report: Report) -> dict[str, Any]:
     """What the README and the page say of a report.
 
     Returns:
-        `name`; `shipped`, how the shipped model answers about the run's videos, and `tasks`, the full system's answers:
-        a `Block` each, or None; `tables`, the other blocks of the registry; `finding`; `plumbing`, a warning where a
-        base model is a random one; `looked_at`, how recipes were chosen by the test objects, if these are the
-        development split's; `other_models`, where published figures stand beside; `stands_on`, what a figure is worth:
-        models with their size, test objects, seeds; `beyond`, the settings that its last fact counts; `origin`:
-        command, hash of the code, data, base models by hash, packages.
+        `name`; `trained`, whether the run has models of its own; `shipped`, how models that were trained before answer
+        about its videos, and `tasks`, the full system's answers: a `Block` each, or None; `tables`, the other blocks of
+        the registry; `finding`; `plumbing`, a warning where a base model is a random one; `looked_at`, how recipes were
+        chosen by the test objects, if these are the development split's; `other_models`, where published figures stand
+        beside; `stands_on`, what a figure is worth: models with their size, test objects, seeds; `beyond`, the settings
+        that its last fact counts; `origin`: command, hash of the code, data, models by hash, packages.
     """
-    said, tasks = report.provenance, FIVE_TASKS.block(report)
+    said, tasks, shipped = report.provenance, FIVE_TASKS.block(report), SHIPPED_TABLE.block(report)
+    trained = bool(said["base_models"])
+    if trained and shipped:  # The paper's figures stand beside the models of this run.
+        shipped.frame.drop(columns=[c for c in shipped.frame if c.startswith("Published")], inplace=True)
     if tasks:
         # The table of the first screen says whose figures these are in its heads.
         heads = tasks.frame.columns.str.replace(
@@ -50,13 +54,14 @@ def sections(report: Report) -> dict[str, Any]:
         tasks.frame.columns = heads.str.replace(r"Published (\d+b)", r"Published (Vicuna \1)", regex=True)
     return {
         "name": report.folder.name,
-        "shipped": SHIPPED_TABLE.block(report),
+        "trained": trained,
+        "shipped": shipped,
         "tasks": tasks,
         "tables": [block for table in TABLES if (block := table.block(report))],
         "finding": finding(report),
         "plumbing": PLUMBING if at_random(said) else "",
         "looked_at": said["settings"] if said["split"] == "development" else "",
-        "other_models": OTHER_MODELS if len(report.published) else "",
+        "other_models": (OTHER_MODELS if trained else OTHER_QUESTIONS) if len(report.published) else "",
         "stands_on": render("stands_on.md", said=said, shown=SHOWN_WORDS).splitlines(),
         "beyond": render("beyond.md", said=said).strip(),
         "origin": render("origin.md", said=said).splitlines(),

@@ -37,8 +37,12 @@ SYSTEM_WORDS = {
     "none": "without OPD",
     "needed": "OPD as needed",
 }
-SHOWN_WORDS = {"frames": "frames of the videos", "photos": "photos of the objects"}
-"""What vision-only models were shown, in the place where others have their touch."""
+SHOWN_WORDS = {
+    "frames": "frames of the videos",
+    "photos": "photos of the objects",
+    "answers from outside": "answered outside this project",
+}
+"""What models that this project does not run were shown, in the place where others have their touch."""
 ENCODERS = {"finetuned": "fine-tuned", "base": "base", "words": "fine-tuned, its classes in words"}
 PARTS = {"language": "language model", "lora": "LoRA", "opd": "OPD"}
 """Parts of the full system that are called otherwise than in effects.csv."""
@@ -71,11 +75,14 @@ class Table:
         What is published is joined by `KEYS`, in columns of their own.
         """
         rows = self.select(report)
+        if self.key == "shipped":  # They are full systems, too.
+            rows = rows.assign(moves=moves(report.scores, rows))
         shown: dict[str, list[str]] = {}
         for name in self.columns:
             if name == "published":
-                shown |= _beside(rows, report.published)
-            else:
+                full = rows.assign(**FULL).where(rows["touch"] == Shown.TOUCH, rows) if self.key == "shipped" else rows
+                shown |= _beside(full, report.published)
+            elif name != "moves" or rows["moves"].any():
                 heading, cell = COLUMNS[name]
                 shown[heading] = [cell(row) for row in rows.to_dict("records")]
         return pd.DataFrame(shown, index=rows.index, dtype=object)
@@ -118,6 +125,14 @@ def marked(scores: pd.DataFrame) -> pd.DataFrame:
         whole=scores["measure"].isin({CHOICE, COMBINED, *(task.measure for task in TASKS.values())}),
         trained=~scores["task"].isin(untrained),
     )
+
+
+def moves(scores: pd.DataFrame, rows: pd.DataFrame) -> list[str]:
+    """Of rows over all seeds, the lowest and highest accuracy of one seed; nothing where there is only one."""
+    own = scores[scores["seed"] != ALL_SEEDS].groupby([*KEYS, "touch"])["accuracy"]
+    found = own.agg(["min", "max", "count"]).to_dict("index")
+    sets = [found[tuple(row)] for row in rows[[*KEYS, "touch"]].itertuples(index=False, name=None)]
+    return [f"{100 * s['min']:.1f} to {100 * s['max']:.1f} ({s['count']})" if s["count"] > 1 else "" for s in sets]
 
 
 def headline(scores: pd.DataFrame) -> pd.DataFrame:
@@ -211,7 +226,7 @@ def system(row: dict[str, Any]) -> str:
     # Rules on the heads' classes are told of some questions what the language model is not.
     told = f", {TASKS[task].told}" if task in TASKS and TASKS[task].told else ""
     others: dict[str, str] = {
-        Shown.TOUCH: f"{encoder}, as it is shipped",
+        Shown.TOUCH: f"{encoder}, as it is",
         Shown.CLASSES: f"its heads and rules alone{told}",
         Shown.STANDARDISED: f"{encoder}, embeddings standardised by these videos",
         **{shown: f"{encoder}, {words}" for shown, words in SHOWN_WORDS.items()},
@@ -235,6 +250,7 @@ COLUMNS: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
     "opd": ("OPD", itemgetter("opd")),
     "touch": ("Touch", itemgetter("touch")),
     "measured": ("Measured % [95 %]", measured),
+    "moves": ("From set to set % (sets)", itemgetter("moves")),
     "strict": ("As published %", lambda row: number(row["strict"], scale=100)),
     "chance": ("Chance %", lambda row: number(row["chance"], scale=100)),
     "unread": ("Unread %", lambda row: number(row["unread"] / row["n"], scale=100)),

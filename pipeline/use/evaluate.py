@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from pipeline.config import Params
+from pipeline.core.layout import SHIPPED
 from pipeline.core.records import Part
 from pipeline.encoder.records import Classification
 from pipeline.evaluation.grading import conclude, grade
@@ -19,7 +20,6 @@ from pipeline.running.progress import track
 from pipeline.tasks.base import Pool
 from pipeline.tasks.questions import build_questions, counts_by_task
 from pipeline.training.embeddings import EmbeddingStore
-from pipeline.use.folder import SHIPPED
 from pipeline.use.model import Octopi
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.records import Video

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-SHIPPED = Path(__file__).parents[1] / "pretrained" / "octopi-small"
-"""The model that is part of the package."""
 FORMAT = 2
 LIBRARIES = ("octopi-pipeline", "torch", "transformers", "peft", "open_clip_torch", "timm", "av")
 """Whose versions config.json names."""

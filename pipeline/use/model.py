@@ -15,6 +15,7 @@ import torch
 
 from pipeline.config import LANGUAGE_DIR, LanguageConfig
 from pipeline.core.io import fingerprint
+from pipeline.core.layout import SHIPPED
 from pipeline.core.records import Opd, Turn
 from pipeline.core.runtime import DeviceName, DtypeName, Quantization, derive_seed, name_dtype, resolve_device
 from pipeline.language.chat import TACTILE, TACTILE_TOKENS
@@ -25,7 +26,7 @@ from pipeline.running.progress import quiet_libraries
 from pipeline.tasks import opd, pc, pom, psr, pss
 from pipeline.tasks.base import LETTERS
 from pipeline.use.encoding import Classified, EncodedVideo, VideoEncoder
-from pipeline.use.folder import ENCODER_DIR, SHIPPED, ModelConfig, chat_sample, find_base, read_folder
+from pipeline.use.folder import ENCODER_DIR, ModelConfig, chat_sample, find_base, read_folder
 from pipeline.use.memory import Remembered, most_similar, recall, remember
 from pipeline.use.results import Choice, Comparison, Description, Exchange, Matching, Ranking, Recognition, Touch, Video
 from pipeline.videos.catalogue import Catalogue, Object, Property

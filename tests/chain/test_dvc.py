@@ -157,13 +157,13 @@ EDITS = {
     "pipeline/report/tables.py": {"report", "publish"},
     "pipeline/running/progress.py": set(),
     "pipeline/weights/backbones.py": {
-        *("weights", "pretrain", "finetune_encoder", "embed", "shipped"),
+        *("weights", "pretrain", "finetune_encoder", "embed", "evaluate"),
         "report",
         "package",
     },
-    "pipeline/evaluation/grading.py": {"grade", "shipped", *RUNS_ALL},
-    "pipeline/tasks/pc.py": {"questions", "grade", "shipped", *RUNS_ALL},
-    "pipeline/language/chat.py": {"align", "lora", "answer", "shipped", "report", "package"},
+    "pipeline/evaluation/grading.py": {"grade", "evaluate", *RUNS_ALL},
+    "pipeline/tasks/pc.py": {"questions", "grade", "evaluate", *RUNS_ALL},
+    "pipeline/language/chat.py": {"align", "lora", "answer", "evaluate", "report", "package"},
 }
 """A row of a report, a column of its tables, a line of progress, a backbone, a grader, a prompt and its grader, a chat
 format: and the stages that an edit makes stale. What follows these runs where their outputs come out otherwise."""

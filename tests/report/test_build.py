@@ -197,21 +197,21 @@ def test_the_shipped_models_answers_come_first_and_the_plumbing_is_folded(tmp_pa
     metrics = write_report(params, tmp_path)
     assert [name for name in metrics if name.isupper()] == ["OPD", "PC", "PSS", "PSR"]
     usual = load_report(tmp_path / "reports" / params.report_name)
-    assert "shipped" not in (usual.folder / "README.md").read_text()
+    assert "Models that were trained before" not in (usual.folder / "README.md").read_text()
     common = {"measure": "choice", "parsed": True, "truncated": False, "expected": "yes", "predicted": "yes", "seed": 0}
     said = {"task": "PC", "model": "octopi-small", "shown": Shown.TOUCH, **common}
     rows = [
         GradedVision(question_id=f"PC-test-{i:05d}", correct=i < 30, objects=(f"o{i}", f"p{i}"), **said)
         for i in range(40)
     ]
-    write_table(tmp_path / "data" / "shipped.parquet", GradedVision, rows)
+    write_table(tmp_path / "data" / "evaluated.parquet", GradedVision, rows)
     write_report(params, tmp_path)
     report = load_report(tmp_path / "reports" / params.report_name)
     text = (report.folder / "README.md").read_text()
-    first = ("The model that is shipped", "<details>", "The full system's interval", "</details>")
+    first = ("Models that were trained before", "<details>", "The full system's interval", "</details>")
     places = [text.index(words) for words in first]
     assert places == sorted(places)
-    assert "| Property Comparison (PC) | octopi-small, as it is shipped | 75.0 [" in text[: places[1]]
+    assert "| Property Comparison (PC) | octopi-small, as it is | 75.0 [" in text[: places[1]]
     assert len(report.scores) == len(usual.scores) + 2, "of its seed, and over all"
     page = write_page(tmp_path).read_text()
     order = [page.index(f'id="{params.report_name}-{part}"') for part in ("shipped", "tasks", "stands-on")]

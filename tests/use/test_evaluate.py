@@ -13,13 +13,14 @@ from typing import Any, cast
 
 import pytest
 import torch
-from pipeline.use.shipped import answers_about
+from pipeline.use.evaluate import answers_about
 from safetensors.torch import load_file
 from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.config import LANGUAGE_DIR
 from pipeline.core.io import read_json, read_table, write_table
+from pipeline.core.layout import SHIPPED
 from pipeline.evaluation.records import GradedVision, Shown
 from pipeline.evaluation.rows import ALL_SEEDS
 from pipeline.language.base import ADAPTER_CONFIG, ADAPTER_WEIGHTS
@@ -29,7 +30,7 @@ from pipeline.scales import compose, write_params
 from pipeline.tasks.base import find_level
 from pipeline.use import folder
 from pipeline.use.adapt import adapt
-from pipeline.use.folder import SHIPPED, Base, find_base, read_folder
+from pipeline.use.folder import Base, find_base, read_folder
 from pipeline.use.model import Octopi
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.records import Video
@@ -144,7 +145,7 @@ def test_a_runs_videos_are_asked_about_as_they_are_and_standardised(
 ) -> None:
     """What it says of them is what it says to a person who asks; an object that it was trained on stops the stage."""
     changed = ["data.source=videos", f"data.dir={EXAMPLES}", f"data.catalogue={ROOT}/pipeline/physiclear"]
-    few = ["kernels=machine", "shipped=4", "questions.evaluation={opd:9,pc:9,pss:0,pom:9,psr:0}"]
+    few = ["kernels=machine", "evaluate.questions=4", "questions.evaluation={opd:9,pc:9,pss:0,pom:9,psr:0}"]
     write_params(compose("smoke", [*changed, *few], ROOT / "conf"), tmp_path / "params.yaml")
     monkeypatch.chdir(tmp_path)
     # Two threads of each of two test processes would wait for each other on two cores.
@@ -154,8 +155,8 @@ def test_a_runs_videos_are_asked_about_as_they_are_and_standardised(
         videos = fake_videos(objects, per_object=1)
         videos = [v.model_copy(update={"path": f"{objects[v.object_id]}.mp4"}) for v in videos]
         write_table(tmp_path / "data" / "videos.parquet", Video, videos)
-        runpy.run_path(str(ROOT / "stages" / "shipped.py"), run_name="__main__")
-        return read_table(tmp_path / "data" / "shipped.parquet", GradedVision)
+        runpy.run_path(str(ROOT / "stages" / "evaluate.py"), run_name="__main__")
+        return read_table(tmp_path / "data" / "evaluated.parquet", GradedVision)
 
     objects = {"pillow": "soft", "baseball": "hard", "steel_wool": "rough"}
     graded = run(objects)
@@ -171,7 +172,7 @@ def test_a_runs_videos_are_asked_about_as_they_are_and_standardised(
         elif row.measure == "hardness" and row.shown is Shown.TOUCH:
             assert find_level(said[row.objects[0]].sentence, octopi.catalogue.properties[0]) is not None
             assert f" {row.predicted} " in said[row.objects[0]].sentence
-    with pytest.raises(SystemExit, match=r"octopi-small knows object_\S+, so it is not asked; set shipped to 0"):
+    with pytest.raises(SystemExit, match=r"evaluate.models: octopi-small was trained on object_\S+, which"):
         run({next(iter(octopi.catalogue.objects)): "soft"})
 
 
@@ -182,8 +183,8 @@ def test_it_is_not_asked_about_properties_or_classes_of_others(
     first, *rest = catalogue.properties
     known = SimpleNamespace(properties=(first.model_copy(update=update), *rest))
     model = SimpleNamespace(catalogue=known, numbered=True, name="octopi-small")
-    params = compose("smoke", ["shipped=4", f"data.catalogue={ROOT}/pipeline/physiclear"], ROOT / "conf")
-    assert answers_about(cast(Octopi, model), params, fake_videos(["rug"])) == []
+    params = compose("smoke", ["evaluate.questions=4", f"data.catalogue={ROOT}/pipeline/physiclear"], ROOT / "conf")
+    assert answers_about(cast(Octopi, model), params, fake_videos(["rug"]), {}) == []
     assert re.search(r"octopi-small is not asked: .*(warmth: soft|yielding).*, but .*hardness: soft", caplog.text)
 
 
