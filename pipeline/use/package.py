@@ -137,7 +137,10 @@ def export(folder: Path, to: Path, *, with_base: bool = False, base: Path | None
     with atomic_folder(to) as made:
         shutil.copytree(folder, made, dirs_exist_ok=True, ignore=shutil.ignore_patterns(BASE_DIR))
         if with_base:
-            shutil.copytree(find_base(folder, config.base, base), made / BASE_DIR)
+            found, doubts = find_base(folder, config.base, base)
+            if doubts:
+                raise UserError(f"{found}: {doubts[0]}; put no other model in, and name it where it is asked")
+            shutil.copytree(found, made / BASE_DIR)
 
 
 class Score(NamedTuple):

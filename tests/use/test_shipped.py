@@ -103,9 +103,9 @@ def test_its_language_model_is_made_once(
     monkeypatch.setattr(folder, "make", make)
     monkeypatch.chdir(tmp_path)
     known = Base(folder="data/weights/smollm2", files={"model.safetensors": sha256(b"weights").hexdigest()})
-    assert find_base(tmp_path / "model", known) == cached
+    assert find_base(tmp_path / "model", known) == (cached, ())
     assert "smollm2 is made of an installed package" in caplog.text
-    assert find_base(tmp_path / "model", known) == cached
+    assert find_base(tmp_path / "model", known) == (cached, ())
 
 
 @pytest.fixture(scope="module")
