@@ -322,12 +322,12 @@ def diff(
 Video = Annotated[str, typer.Argument(help="A video.")]
 Another = Annotated[str, typer.Argument(help="Another one.")]
 Property = Annotated[str, typer.Argument(help="Such as hardness.")]
-Model = Annotated[Path | None, typer.Option(help="Folder of a trained model; by default the one that is shipped.")]
+Model = Annotated[str | None, typer.Option(help="Folder, or hf://USER/NAME[@REVISION]; by default the shipped one.")]
 Base = Annotated[
-    Path | None, typer.Option(help="Folder of its language model, where it lies in none of the known places.")
+    Path | None, typer.Option(help="Folder of its language model, where no known place has it, or of one like it.")
 ]
 Device = Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")]
-Folder = Annotated[Path | None, typer.Argument(help="A trained model; by default the one that is shipped.")]
+Folder = Annotated[str | None, typer.Argument(help="Folder, or hf://USER/NAME[@REVISION]; by default the shipped one.")]
 Memory = Annotated[Path, typer.Option(help="Folder of remembered touches.")]
 TOUCHES = Path("touches")
 
@@ -533,6 +533,24 @@ def export(
 
 
 @app.command()
+def push(
+    folder: Annotated[Path, typer.Argument(help="Folder of a trained model, such as models/finetuned-with-all-0.")],
+    name: Annotated[str, typer.Argument(metavar="USER/NAME", help="Repository; made where it is not there.")],
+    private: Annotated[bool, typer.Option("--private", help="Make it a private one.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="List the files and the card, and send nothing.")] = False,
+) -> None:
+    """Put a trained model on the Hugging Face Hub, in place of what lies there; `--model hf://USER/NAME` gets it."""
+    from pipeline.training.card import CARD_FILE
+    from pipeline.use.hub import HUB, files_of, upload
+
+    if dry_run:
+        typer.echo("\n".join([*files_of(folder), "", (folder / CARD_FILE).read_text(encoding="utf-8")]))
+        return
+    upload(folder, name, private=private)
+    typer.echo(f"{HUB}{name}: written; name it so with --model")
+
+
+@app.command()
 def serve(
     folder: Folder = None,
     host: Annotated[str, typer.Option(help="Address; another than 127.0.0.1 needs a token.")] = "127.0.0.1",
@@ -546,7 +564,7 @@ def serve(
     from pipeline.core.layout import SHIPPED
     from pipeline.use.serve import serve
 
-    serve(lambda: _load(folder, base, device), (folder or SHIPPED).resolve().name, host, port, token_file, places)
+    serve(lambda: _load(folder, base, device), Path(folder or SHIPPED).resolve().name, host, port, token_file, places)
 
 
 @app.command()
@@ -569,7 +587,7 @@ def _print_notes(notes: Sequence[str]) -> None:
         typer.echo(f"note: {note}", err=True)
 
 
-def _load(folder: Path | None, base: Path | None, device: str) -> Octopi:
+def _load(folder: str | None, base: Path | None, device: str) -> Octopi:
     from pipeline.core.runtime import DeviceName
     from pipeline.running.progress import quiet_libraries
 

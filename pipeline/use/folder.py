@@ -38,6 +38,9 @@ ENCODER_DIR, BASE_DIR, BACKBONE_DIR = "encoder", "base", "backbone"
 TRAINED, SCENES = "encoder.safetensors", "scenes.safetensors"
 IDENTITY = ("*.safetensors", "tokenizer.json")
 """Files by which a base language model is known."""
+SHAPES = ("model_type", "hidden_size", "num_hidden_layers", "num_attention_heads", "num_key_value_heads")
+"""What two language models of one architecture have in common in their config.json."""
+OTHER_BASE = "its language model is not the one of its training, so the card's figures are not its own"
 
 M = TypeVar("M", bound=BaseModel)
 Rounded = Annotated[float, AfterValidator(lambda value: round(value, 4))]
@@ -137,11 +140,12 @@ def read_folder(folder: Path) -> tuple[ModelConfig, Catalogue]:
     return config, _validate(Catalogue, _read(folder / CATALOGUE), folder / CATALOGUE)
 
 
-def find_base(folder: Path, base: Base, given: Path | None = None) -> Path:
-    """The folder of the language model: the one given, or the first of the known places that has it.
+def find_base(folder: Path, base: Base, given: Path | None = None) -> tuple[Path, tuple[str, ...]]:
+    """The folder of the language model, the one given or the first of the known places that has it, and a doubt.
 
     Known places: `base/` in the folder, where it lay in training (from here, and from above the folder), weights/ by
-    its name, and the user's cache, where one that an installed package holds is made, once.
+    its name, and the user's cache, where one that an installed package holds is made, once. One that is given may have
+    other weights, which is the doubt, but no other shapes or vocabulary.
 
     Raises:
         UserError: where there is none, or it is another.
@@ -156,8 +160,10 @@ def find_base(folder: Path, base: Base, given: Path | None = None) -> Path:
     for place in places:
         if any(place.glob("*.safetensors")):
             if not (wrong := sorted(set(Base.of(place).files.items()) ^ set(base.files.items()))):
-                return place
-            other = f"{place}: is another language model than {folder} was trained on ({wrong[0][0]} differs)"
+                return place, ()
+            if given and _alike(folder, base, given, "tokenizer.json" not in dict(wrong)):
+                return place, (OTHER_BASE,)
+            other = f"{place}: is another language model than {folder} was trained on ({wrong[-1][0]} differs)"
     if other:
         raise UserError(f"{other}; name the folder of {base.folder} with --base")
     looked = ", ".join(map(str, dict.fromkeys(places)))
@@ -165,6 +171,19 @@ def find_base(folder: Path, base: Base, given: Path | None = None) -> Path:
         f"{folder}: its language model {base.folder} is not there (looked in {looked}); name its folder with --base, "
         f"or copy it with `octopi export {folder} TO --with-base` where it is"
     )
+
+
+def _alike(folder: Path, base: Base, given: Path, same_tokenizer: bool) -> bool:
+    """Whether shapes and words are those of training; where its language model is not at hand, the tokenizer tells."""
+    from pipeline.language.base import load_tokenizer
+
+    try:
+        own, _ = find_base(folder, base)
+    except UserError:
+        return same_tokenizer
+    words = [load_tokenizer(place).get_vocab() for place in (own, given)]
+    forms = [read_json(place / "config.json") for place in (own, given)]
+    return bool(words[0] == words[1]) and all(forms[0].get(key) == forms[1].get(key) for key in SHAPES)
 
 
 def chat_sample(tokenizer: PreTrainedTokenizerBase, language: LanguageConfig) -> str:

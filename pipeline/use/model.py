@@ -27,6 +27,7 @@ from pipeline.tasks import opd, pc, pom, psr, pss
 from pipeline.tasks.base import LETTERS
 from pipeline.use.encoding import Classified, EncodedVideo, VideoEncoder
 from pipeline.use.folder import ENCODER_DIR, ModelConfig, chat_sample, find_base, read_folder
+from pipeline.use.hub import HUB, download
 from pipeline.use.memory import Remembered, most_similar, recall, remember
 from pipeline.use.results import Choice, Comparison, Description, Exchange, Matching, Ranking, Recognition, Touch, Video
 from pipeline.videos.catalogue import Catalogue, Object, Property
@@ -52,7 +53,7 @@ class Octopi:
         config: What the folder's config.json says.
         properties: The catalogue's properties.
         numbered: Whether training named objects only "object 1" and so on; such a model cannot repeat other names.
-        doubts: What should make one doubt every answer; empty for a model that was trained from real weights.
+        doubts: What should make one doubt every answer: random weights, or another language model than in training.
     """
 
     def __init__(
@@ -80,6 +81,7 @@ class Octopi:
         cls,
         folder: Path | str | None = None,
         *,
+        revision: str | None = None,
         base: Path | str | None = None,
         device: DeviceName = "auto",
         dtype: DtypeName = "auto",
@@ -88,7 +90,10 @@ class Octopi:
 
         Args:
             folder: `models/<variant>`, or a copy of it; by default the model that is shipped, and a line says so.
-            base: Folder of the language model; by default the first known place that has it.
+                "hf://USER/NAME", and this form alone, is downloaded from the Hugging Face Hub, and kept in its cache.
+            revision: Of a model on the Hub: branch, tag or commit.
+            base: Folder of the language model; by default the first known place that has it. Another of the same
+                shapes and vocabulary is taken, and doubted.
             device: What to compute on; `auto` takes CUDA, then MPS, then the CPU.
             dtype: Number format of the language model; `auto` is that of the evaluation, where the device computes it.
 
@@ -100,9 +105,13 @@ class Octopi:
             logger.warning(
                 "no model is named, so %s answers, which is shipped (its README.md has its figures)", SHIPPED
             )
+        if isinstance(folder, str) and folder.startswith(HUB):
+            folder = download(folder, revision)
+        elif revision is not None:
+            raise UserError(f"{folder}: a folder has no revision {revision}; name a model on the Hub, {HUB}USER/NAME")
         folder = SHIPPED if folder is None else Path(folder)
         config, catalogue = read_folder(folder)
-        found = find_base(folder, config.base, None if base is None else Path(base))
+        found, doubts = find_base(folder, config.base, None if base is None else Path(base))
         place = resolve_device(device)
         if dtype == "auto":
             dtype = "float32" if config.language.dtype == "float32" else name_dtype("auto", device)
@@ -114,7 +123,9 @@ class Octopi:
             raise UserError(
                 f"{found}: its chat format is another than in training; name the folder of {config.base.folder}"
             )
-        return cls(folder, config, catalogue, llm, place)
+        model = cls(folder, config, catalogue, llm, place)
+        model.doubts += doubts
+        return model
 
     # ---- asking ----
 

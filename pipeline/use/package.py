@@ -10,6 +10,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
+from huggingface_hub import EvalResult
+
 from pipeline.config import LANGUAGE_DIR, Params
 from pipeline.core import layout
 from pipeline.core.io import atomic_folder, read_json, read_jsonl, read_table, save_tensors, sha256, write_json
@@ -134,7 +136,10 @@ def export(folder: Path, to: Path, *, with_base: bool = False, base: Path | None
     with atomic_folder(to) as made:
         shutil.copytree(folder, made, dirs_exist_ok=True, ignore=shutil.ignore_patterns(BASE_DIR))
         if with_base:
-            shutil.copytree(find_base(folder, config.base, base), made / BASE_DIR)
+            found, doubts = find_base(folder, config.base, base)
+            if doubts:
+                raise UserError(f"{found}: {doubts[0]}; put no other model in, and name it where it is asked")
+            shutil.copytree(found, made / BASE_DIR)
 
 
 class Score(NamedTuple):
@@ -211,13 +216,17 @@ def _write_card(
         bases["tactile encoder"] = Path(params.encoder.weights)
     if "scenes" in params.encoder.backbone:
         bases["tactile encoder, pretrained on synthetic scenes"] = layout.PRETRAINED
-    dataset = f"{params.data.source}, split {params.split.name}, test objects"
     results = [
-        {
-            "task": {"type": "visual-question-answering", "name": TASKS[task].title},
-            "dataset": {"type": "tactile-videos", "name": dataset},
-            "metrics": [{"type": "accuracy", "value": s.accuracy, "args": {"low": s.low, "high": s.high, "n": s.n}}],
-        }
+        EvalResult(
+            task_type="visual-question-answering",
+            task_name=TASKS[task].title,
+            dataset_type="tactile-videos",
+            dataset_name=f"{params.data.source}, split {params.split.name}, test objects",
+            dataset_config=task,  # By which the Hub tells results about one data set apart.
+            metric_type="accuracy",
+            metric_value=s.accuracy,
+            metric_args={"low": s.low, "high": s.high, "n": s.n},
+        )
         for task, s in scores.items()
     ]
     write_card(
@@ -239,7 +248,7 @@ def _write_card(
             **config.versions,
         },
         limits=LIMITS,
-        front={"library_name": "octopi-pipeline", "model-index": [{"name": config.variant, "results": results}]},
+        front={"library_name": "octopi-pipeline", "model_name": config.variant, "eval_results": results},
         tables={
             "Scores": [
                 {

@@ -94,6 +94,12 @@ DOWNLOADED = {
     "sparsh": Downloaded("facebook/sparsh-dino-base", "sparsh-dino-base"),
 }
 """By the name that `octopi weights` takes; `pipeline.weights.published` checks and converts them."""
+REPOSITORIES = {
+    "efficientnet-lite0": "timm/tf_efficientnet_lite0.in1k",
+    "smollm2": "HuggingFaceTB/SmolLM2-135M-Instruct",
+    **{model.folder: model.repository for model in DOWNLOADED.values()},
+}
+"""Where base models are published on the Hugging Face hub, by the name of their folder."""
 GET_LLM = (
     "get Vicuna with `hf download lmsys/vicuna-7b-v1.5 --local-dir {folder}-pickled` and `octopi weights vicuna-7b "
     "{folder}-pickled --to {folder} --trust-pickle`, or set language.weights=data/weights/smollm2"

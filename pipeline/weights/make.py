@@ -15,7 +15,7 @@ import yaml
 
 from pipeline.core.io import atomic_folder, write_text
 from pipeline.running.errors import UserError
-from pipeline.weights import DOWNLOADED, MADE, installed, tiny
+from pipeline.weights import DOWNLOADED, MADE, REPOSITORIES, installed, tiny
 from pipeline.weights.check import VICUNA_7B
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ RECIPES = {
         write_smollm2,
         {
             "license": "apache-2.0",
-            "base_model": ["HuggingFaceTB/SmolLM2-135M-Instruct"],
+            "base_model": [REPOSITORIES["smollm2"]],
             "library_name": "transformers",
             "language": ["en"],
             "taught": "pretrained on English text and tuned to follow instructions by its makers",

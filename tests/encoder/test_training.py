@@ -234,9 +234,10 @@ def test_a_recipe_is_a_module_and_a_line(
 
 
 def test_the_card_names_weights_by_hash_data_and_settings(weights: Path, data: EncoderData, tmp_path: Path) -> None:
-    write_encoder_card(tmp_path / "a", data, config(weights, "paper"), 3, "scenes")
+    (published := tmp_path / "clip-vit-large-patch14").symlink_to(weights)
+    write_encoder_card(tmp_path / "a", data, config(published, "paper"), 3, "scenes")
     text = (tmp_path / "a" / "README.md").read_text()
-    assert yaml.safe_load(text.split("---\n")[1])["base_model"] == [weights.as_posix()]
+    assert yaml.safe_load(text.split("---\n")[1])["base_model"] == ["timm/vit_large_patch14_clip_224.openai"]
     digest = hashlib.sha256((weights / "open_clip_model.safetensors").read_bytes()).hexdigest()
     lines = [digest, "| learning_rate | 0.001 |", "| seed | 3 |", "| training videos (scenes) | 5 |", "hardness"]
     assert all(line in text for line in lines)

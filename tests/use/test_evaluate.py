@@ -13,7 +13,6 @@ from typing import Any, cast
 
 import pytest
 import torch
-from pipeline.use.evaluate import answers_about
 from safetensors.torch import load_file
 from typer.testing import CliRunner
 
@@ -30,6 +29,7 @@ from pipeline.scales import compose, write_params
 from pipeline.tasks.base import find_level
 from pipeline.use import folder
 from pipeline.use.adapt import adapt
+from pipeline.use.evaluate import answers_about
 from pipeline.use.folder import Base, find_base, read_folder
 from pipeline.use.model import Octopi
 from pipeline.videos.catalogue import Catalogue
@@ -104,9 +104,9 @@ def test_its_language_model_is_made_once(
     monkeypatch.setattr(folder, "make", make)
     monkeypatch.chdir(tmp_path)
     known = Base(folder="data/weights/smollm2", files={"model.safetensors": sha256(b"weights").hexdigest()})
-    assert find_base(tmp_path / "model", known) == cached
+    assert find_base(tmp_path / "model", known) == (cached, ())
     assert "smollm2 is made of an installed package" in caplog.text
-    assert find_base(tmp_path / "model", known) == cached
+    assert find_base(tmp_path / "model", known) == (cached, ())
 
 
 @pytest.fixture(scope="module")

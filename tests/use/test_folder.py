@@ -16,7 +16,7 @@ from pipeline.cli import app
 from pipeline.core.records import Part
 from pipeline.evaluation.grading import grade
 from pipeline.tasks import TASKS
-from pipeline.use.folder import FORMAT, Base, ModelConfig, read_folder
+from pipeline.use.folder import FORMAT, OTHER_BASE, Base, ModelConfig, read_folder
 from pipeline.use.model import Octopi
 from pipeline.use.package import export, package
 from pipeline.videos.catalogue import load_catalogue
@@ -43,7 +43,7 @@ def test_it_holds_safetensors_and_text_alone_and_a_card(made: Made) -> None:
     text = (made.folder / "README.md").read_text()
     assert "| test objects | Looked at before. |" in text, "what the report knows of them"
     front = yaml.safe_load(text.split("---\n")[1])
-    assert front["base_model"][0] == "llama"
+    assert "base_model" not in front, "none of them is on the Hub"
     catalogue = load_catalogue(Path(ROOT / made.params.data.catalogue))
     scores = [s for s in grade(made.questions, made.predictions, catalogue) if s.measure in ("choice", "combined")]
     for result in front["model-index"][0]["results"]:
@@ -100,10 +100,26 @@ def test_export_with_its_base_needs_nothing_else(made: Made, copy: Path, files: 
 def test_a_base_by_name_and_one_in_a_known_place(copy: Path, llama: Path, tmp_path: Path) -> None:
     assert Octopi.from_pretrained(copy, base=llama).config.base.folder == "llama"
     other = write_llama(copy / "base", seed=5)
-    with refused(r"base: is another language model .*model.safetensors differs"):
+    shutil.copytree(llama, tmp_path / "llama")
+    assert not Octopi.from_pretrained(copy).doubts, "another's is passed over where it is not named"
+    assert Octopi.from_pretrained(copy, base=other).doubts == (OTHER_BASE,)
+    with refused(OTHER_BASE):
+        export(copy, tmp_path / "whole", with_base=True, base=other)
+    tokenizer = other / "tokenizer.json"
+    words = json.loads(tokenizer.read_text())
+    tokenizer.write_text(json.dumps(words))
+    assert Octopi.from_pretrained(copy, base=other).doubts == (OTHER_BASE,), "the same words in another file"
+    with refused(r"deep: is another language model"):
+        Octopi.from_pretrained(copy, base=write_llama(tmp_path / "deep", num_hidden_layers=3))
+    own = (tmp_path / "llama").rename(tmp_path / "away")
+    with refused(r"base: is another language model .*tokenizer.json differs"):
         Octopi.from_pretrained(copy, base=other)
-    other = shutil.copytree(llama, tmp_path / "llama")
-    assert Octopi.from_pretrained(copy).config.variant == "finetuned-with-all-0", "another's is passed over"
+    own.rename(tmp_path / "llama")
+    words["model"]["vocab"] |= {"!": words["model"]["vocab"]['"'], '"': words["model"]["vocab"]["!"]}
+    tokenizer.write_text(json.dumps(words))
+    with refused(r"base: is another language model .*tokenizer.json differs"):
+        Octopi.from_pretrained(copy, base=other)
+    other = tmp_path / "llama"
     template = "{% for m in messages %}<{{ m.role }}>{{ m.content }}</s>{% endfor %}"
     template += "{% if add_generation_prompt %}<assistant>{% endif %}"
     (other / "chat_template.jinja").write_text(template)
