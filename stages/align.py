@@ -23,7 +23,7 @@ if __name__ == "__main__":
         assigned = read_table(split_file(seed), Assignment)
         met = objects_met(run.params.language.start, {a.object_id: a.part for a in assigned})
         model, data = assemble(material, config, "align")
-        if config.begin_with_words and not material.words and not run.params.language.start:
+        if config.begin_with_words and not run.params.language.start:
             begin_with_words(model, data, material.catalogue, material.seed)
         if config.train_embeddings == "all" and model.words is None:
             model.train_words()

@@ -1,7 +1,6 @@
 """Let one variant answer the evaluation questions; the full system also under every input ablation."""
 
 from dataclasses import replace
-from pathlib import Path
 
 from pipeline.core.io import read_jsonl, write_jsonl
 from pipeline.core.layout import answers_dir, embeddings_dir, questions_file, trained_dir
@@ -9,12 +8,10 @@ from pipeline.core.records import Encoder, Lora, Opd, Question, Touch, Variant
 from pipeline.core.runtime import name_dtype
 from pipeline.running.parallel import device_here
 from pipeline.running.stage import matrix_key, stage
-from pipeline.videos.catalogue import load_catalogue
 
 if __name__ == "__main__":
     variant = Variant(*matrix_key(encoder=Encoder, lora=Lora, opd=Opd, seed=None))
     with stage("answer", variant.key, of_variants=True) as run:
-        from pipeline.language.classes import in_words
         from pipeline.language.generate import ModelSource, answer
         from pipeline.language.input_ablation import ablate_input
         from pipeline.training.embeddings import EmbeddingStore
@@ -27,8 +24,6 @@ if __name__ == "__main__":
         source = ModelSource(folder, language.weights, dtype, language.quantization, device, run.started)
         model = replace(source, device=device_here(device))()
         questions = read_jsonl(questions_file(variant.seed), Question)
-        if variant.encoder is Encoder.WORDS:
-            questions = in_words(questions, store, load_catalogue(Path(params.data.catalogue)))
         per_video = params.frames.per_video
         for touch in params.ablation.touches(variant):
             given, shown = ablate_input(store, touch, questions, variant.seed)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -48,8 +47,6 @@ if __name__ == "__main__":
         check_encoder(Path(params.encoder.weights), params.frames.pixels, params.encoder.backbone)
         splits = {seed: read_table(split_file(seed), Assignment) for seed in params.ablation.seeds}
         for which in params.ablation.encoders:
-            if which is Encoder.WORDS:
-                continue
             if which is Encoder.BASE:
                 # It has no seed: its embeddings are computed once and standardised for each.
                 found = embed(run, union(splits.values()), None)
@@ -59,7 +56,3 @@ if __name__ == "__main__":
             for seed, split in splits.items():
                 trained = encoder_dir(seed) / TRAINED_FILE
                 write(run, embeddings_dir(which, seed), split, *embed(run, split, trained))
-        if Encoder.WORDS in params.ablation.encoders:
-            for seed in splits:
-                own, to = (embeddings_dir(which, seed) for which in (Encoder.FINETUNED, Encoder.WORDS))
-                shutil.copytree(own, to, dirs_exist_ok=True)

@@ -61,11 +61,6 @@ def test_committed_params_are_written_as_they_are(tmp_path: Path) -> None:
         (["ablation.seeds=[1,1]"], "ablation.seeds.*repeats"),
         (["ablation.opd=[none]"], "ablation.opd.*lacks the full system's value all"),
         (["split.train_objects=5"], "split.train_objects.*split.name=kfold"),
-        (["ablation.encoders=[finetuned,words]"], "ablation.encoders.*encoder.embedding=logits"),
-        (
-            ["ablation.encoders=[finetuned,words]", "encoder={embedding:logits,standardize:true}", "packaged=all"],
-            "packaged=all.*packaged=full",
-        ),
         (["lora.skip_contradicted=true"], "lora.skip_contradicted.*encoder.embedding=logits"),
         (
             ["lora.skip_contradicted=true", "encoder={embedding:logits,standardize:true}", "questions.two_turns=0.5"],

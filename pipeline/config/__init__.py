@@ -352,8 +352,7 @@ class AblationConfig(Section):
     """
 
     encoders: tuple[Encoder, ...] = (Encoder.FINETUNED, Encoder.BASE)
-    """What the language model is given; the fine-tuned encoder is trained in any case, for the encoder's own table.
-    `words` gives its heads' classes as text (with `encoder.embedding=logits`): does reading touch cost accuracy?"""
+    """What the language model is given; the fine-tuned encoder is trained in any case, for the encoder's own table."""
     lora: tuple[Lora, ...] = (Lora.WITH, Lora.WITHOUT)
     """`without` answers with the alignment's checkpoint."""
     opd: tuple[Opd, ...] = (Opd.ALL, Opd.NONE)
@@ -480,10 +479,6 @@ class Params(Section):
                 f"ablation.seeds {list(self.ablation.seeds)} test on some of the {self.split.folds} folds more often "
                 "than on others; take as many seeds for each fold"
             )
-        if Encoder.WORDS in self.ablation.encoders and self.encoder.embedding != "logits":
-            raise ValueError("ablation.encoders: words are read off the heads' logits; set encoder.embedding=logits")
-        if Encoder.WORDS in self.ablation.encoders and self.packaged == "all":
-            raise ValueError("packaged=all: a variant that is given words reads no videos; set packaged=full")
         if self.lora.skip_contradicted and self.encoder.embedding != "logits":
             raise ValueError("lora.skip_contradicted reads the heads' logits; set encoder.embedding=logits")
         if self.lora.skip_contradicted and self.questions.two_turns:

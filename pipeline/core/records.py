@@ -40,8 +40,6 @@ class Encoder(StrEnum):
 
     FINETUNED = "finetuned"
     BASE = "base"
-    WORDS = "words"
-    """The fine-tuned one; its heads' classes, as text, stand in the place of embeddings."""
 
 
 class Lora(StrEnum):

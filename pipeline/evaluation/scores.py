@@ -43,7 +43,6 @@ RULES = Setting(Encoder.FINETUNED)
 CHANGES: tuple[tuple[str, Setting, Setting], ...] = (
     ("language", FULL, RULES),
     ("encoder", FULL, FULL._replace(encoder=Encoder.BASE)),
-    ("encoder", FULL, FULL._replace(encoder=Encoder.WORDS)),
     ("lora", FULL, FULL._replace(lora=Lora.WITHOUT)),
     ("opd", FULL, FULL._replace(opd=Opd.NONE)),
     ("opd", FULL, FULL._replace(opd=Opd.NEEDED)),

@@ -1,21 +1,23 @@
-"""The classes that property heads predict, read from embeddings that are their logits."""
+"""Which questions follow from the classes that property heads predict, read from embeddings that are their logits."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache
 from itertools import permutations
 
 import torch
 
 from pipeline.core.records import Question
-from pipeline.language.conversations import without_videos
 from pipeline.training.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
 from pipeline.videos.catalogue import Catalogue
 
 
-def classes_of(store: EmbeddingStore, catalogue: Catalogue) -> Callable[[str], list[tuple[int, float]]]:
-    """A function from a video to its predicted class and expected class, property by property.
+def uncontradicted(questions: Sequence[Question], store: EmbeddingStore, catalogue: Catalogue) -> list[Question]:
+    """Leave out comparisons whose right answer does not follow, by their task's rule, from the heads' logits.
+
+    What touch contradicts cannot be learnt from touch: such questions teach to guess. Descriptions, which are about one
+    video each, stay.
 
     The store has logits (`encoder.embedding=logits`); those of training objects are from heads that did not see the
     object, so they err as often as on new objects.
@@ -29,34 +31,8 @@ def classes_of(store: EmbeddingStore, catalogue: Catalogue) -> Callable[[str], l
         found = [part.softmax(1).mean(0) for part in logits.split(sizes, dim=1)]
         return [(int(p.argmax()), float(p @ torch.arange(len(p)).double())) for p in found]
 
-    return classes
-
-
-def in_words(questions: Sequence[Question], store: EmbeddingStore, catalogue: Catalogue) -> list[Question]:
-    """The questions with each video's predicted classes as text in its place, such as "(soft, rough, no bumps)".
-
-    A language model that is trained and asked this way need not read touch: what it lacks then is a matter of language.
-    """
-    said = classes_of(store, catalogue)
-    changed = []
-    for question in questions:
-        texts = [
-            f"({', '.join(p.levels[level] for p, (level, _) in zip(catalogue.properties, said(video), strict=True))})"
-            for video in question.videos
-        ]
-        changed.append(without_videos(question, texts))
-    return changed
-
-
-def uncontradicted(questions: Sequence[Question], store: EmbeddingStore, catalogue: Catalogue) -> list[Question]:
-    """Leave out comparisons whose right answer does not follow, by their task's rule, from the heads' logits.
-
-    What touch contradicts cannot be learnt from touch: such questions teach to guess. Descriptions, which are about one
-    video each, stay.
-    """
-    said = classes_of(store, catalogue)
     compared = ("PC", "PSS", "POM")
-    return [q for q in questions if q.task not in compared or follows(q, [said(v) for v in q.videos], catalogue)]
+    return [q for q in questions if q.task not in compared or follows(q, [classes(v) for v in q.videos], catalogue)]
 
 
 def follows(question: Question, seen: Sequence[Sequence[tuple[int, float]]], catalogue: Catalogue) -> bool:

@@ -14,7 +14,7 @@ from transformers import PreTrainedTokenizerBase
 from pipeline.config import ChatFormat
 from pipeline.core.records import Opd, Question
 from pipeline.core.runtime import derive_seed
-from pipeline.language.chat import IGNORE_INDEX, TACTILE, conclusions, encode, render
+from pipeline.language.chat import IGNORE_INDEX, conclusions, encode, render
 from pipeline.running.errors import UserError
 from pipeline.training.embeddings import FLIPS, EmbeddingStore
 from pipeline.training.sampling import EpochDataset, sample_evaluation, sample_training
@@ -111,18 +111,6 @@ def evaluation_features(question: Question, store: EmbeddingStore, per_video: in
     """The embeddings of a question's videos at uniform intervals: (videos x per_video) x dim."""
     shown = (store.features(v, sample_evaluation(store.count(v), per_video)) for v in question.videos)
     return torch.cat([torch.zeros(0, store.dim), *shown])
-
-
-def without_videos(question: Question, texts: Sequence[str]) -> Question:
-    """The question with a text in the place of each video."""
-    dialogues = []
-    for dialogue in question.dialogues:
-        left, turns = iter(texts), []
-        for turn in dialogue.turns:
-            first, *rest = turn.user.split(TACTILE)
-            turns.append(turn.model_copy(update={"user": first + "".join(next(left) + part for part in rest)}))
-        dialogues.append(dialogue.model_copy(update={"turns": tuple(turns)}))
-    return question.model_copy(update={"videos": (), "dialogues": tuple(dialogues)})
 
 
 def collate(samples: Sequence[Mapping[str, torch.Tensor]]) -> dict[str, torch.Tensor]:

@@ -10,8 +10,7 @@ import torch
 
 from pipeline.core.records import Question, Touch
 from pipeline.core.runtime import derive_seed
-from pipeline.language.chat import TACT_END, TACT_START
-from pipeline.language.conversations import without_videos
+from pipeline.language.chat import TACT_END, TACT_START, TACTILE
 from pipeline.running.errors import UserError
 from pipeline.training.embeddings import EmbeddingStore
 
@@ -32,7 +31,7 @@ def ablate_input(
     if touch is Touch.REAL:
         return store, questions
     if touch is Touch.REMOVED:
-        return store, [without_videos(q, [TACT_START + TACT_END] * len(q.videos)) for q in questions]
+        return store, [without_videos(q) for q in questions]
     found: dict[str, set[str]] = {}
     for question in questions:
         for object_id, video_id in zip(question.objects, question.videos, strict=True):
@@ -58,3 +57,13 @@ def ablate_input(
     noise = torch.randn(ends[-1], store.dim, generator=drawn)
     tensor = store.tensor.mean(0) + store.tensor.std(0, correction=0) * noise
     return store.with_rows({v: range(*span) for v, span in zip(names, pairwise(ends), strict=True)}, tensor), questions
+
+
+def without_videos(question: Question) -> Question:
+    """The question with the two delimiters alone in the place of each video."""
+    dialogues = []
+    for dialogue in question.dialogues:
+        asked = [turn.user.replace(TACTILE, TACT_START + TACT_END) for turn in dialogue.turns]
+        turns = [t.model_copy(update={"user": user}) for t, user in zip(dialogue.turns, asked, strict=True)]
+        dialogues.append(dialogue.model_copy(update={"turns": tuple(turns)}))
+    return question.model_copy(update={"videos": (), "dialogues": tuple(dialogues)})

@@ -18,7 +18,7 @@ from pipeline.core.layout import embeddings_dir, questions_file
 from pipeline.core.records import Encoder, Opd, Question
 from pipeline.core.runtime import derive_seed, name_dtype, seed_everything
 from pipeline.language.base import ADAPTER_WEIGHTS
-from pipeline.language.classes import in_words, uncontradicted
+from pipeline.language.classes import uncontradicted
 from pipeline.language.conversations import ConversationDataset, UpdateSampler, collate
 from pipeline.language.octopi import ADAPTER_DIR, CONFIG_FILE, OctopiForCausalLM, read_config
 from pipeline.running.errors import UserError
@@ -42,8 +42,6 @@ class Material:
     per_video: int
     flip_probability: float
     seed: int
-    words: bool = False
-    """Whether the heads' classes, as text, stand in the place of embeddings."""
     source: str = "videos"
     """`data.source`: whether the videos are synthetic."""
     files: tuple[Path, ...] = ()
@@ -58,7 +56,6 @@ class Material:
         asked, embedded = questions_file(seed, "train"), embeddings_dir(encoder, seed)
         begun = Path(start) / LANGUAGE_DIR / ADAPTER_DIR
         adapter = begun if start and begun.is_dir() else None
-        words = encoder is Encoder.WORDS
         catalogue = Path(params.data.catalogue)
         files = [asked, embedded, catalogue]
         if start:
@@ -72,7 +69,6 @@ class Material:
             opd=opd,
             language=params.language.model_copy(update={"dtype": dtype}),
             per_video=params.frames.per_video,
-            words=words,
             flip_probability=params.encoder.flip_probability,
             seed=params.seed + seed,
             source=params.data.source,
@@ -83,7 +79,7 @@ class Material:
     def fingerprint(self, config: TrainConfig, *inputs: Path) -> str:
         """A short hash of all that a training depends on; `inputs` are files of what was trained before."""
         settings = (config, self.language, self.opd, self.per_video, str(self.flip_probability), self.seed)
-        return fingerprint(*settings, str(self.words), Path(self.language.weights), *self.files, *inputs)
+        return fingerprint(*settings, Path(self.language.weights), *self.files, *inputs)
 
 
 def assemble(
@@ -121,9 +117,6 @@ def assemble(
     drawn, given = usable[: config.samples], set[str]()
     if isinstance(config, LoraTrainConfig) and config.given:
         drawn, given = with_given(drawn, material.opd, config.given, material.seed)
-    if material.words:
-        # Done last, as videos may be exchanged until here.
-        drawn = in_words(drawn, material.store, material.catalogue)
     data = ConversationDataset(
         drawn,
         material.opd,
@@ -214,9 +207,7 @@ def write_model_card(folder: Path, material: Material, data: ConversationDataset
         f"Octopi: a language model with touch, {'fine-tuned with LoRA' if lora else 'aligned'}",
         bases={"language model": Path(material.language.weights)},
         data={
-            "tactile embeddings": "none"
-            if material.words
-            else f"{material.store.folder.name}, {material.per_video} frames a video",
+            "tactile embeddings": f"{material.store.folder.name}, {material.per_video} frames a video",
             "questions": ", ".join(f"{count} {task}" for task, count in sorted(tasks.items())),
             "objects": len({o for q in data.questions for o in q.objects}),
             f"videos ({material.source})": len({v for q in data.questions for v in q.videos}),
@@ -230,9 +221,7 @@ def write_model_card(folder: Path, material: Material, data: ConversationDataset
             "seed": material.seed,
         },
         limits=(
-            "It reads classes in words, and no embeddings."
-            if material.words
-            else "It reads embeddings of the one encoder above; those of another mean nothing to it.",
+            "It reads embeddings of the one encoder above; those of another mean nothing to it.",
             "It was trained on templates of "
             + ", ".join(sorted(tasks))
             + " alone: other questions, and scenarios (PSR), were not trained on.",

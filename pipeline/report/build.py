@@ -15,7 +15,7 @@ from pipeline.config import AblationConfig, Params
 from pipeline.config.params import PARAMS_FILE
 from pipeline.core import layout
 from pipeline.core.io import R, read_csv, read_jsonl, read_table, write_csv, write_json, write_text
-from pipeline.core.records import TENSOR_FILE, Encoder, Lora, Measurement, Part, Prediction, Question, Touch, Variant
+from pipeline.core.records import TENSOR_FILE, Lora, Measurement, Part, Prediction, Question, Touch, Variant
 from pipeline.encoder.records import Classification
 from pipeline.evaluation.calibration import CalibrationRow, calibrated, calibration_rows
 from pipeline.evaluation.grading import conclude, vision_models
@@ -201,7 +201,7 @@ def maps_frame(params: Params, root: Path, catalogue: Catalogue) -> pd.DataFrame
     maps = [pd.DataFrame(columns=["encoder", "method", "video_id", "x", "y", *catalogue.property_names])]
     split = read_table(root / layout.split_file(seed), Assignment)
     tested = sorted((a for a in split if a.part is Part.TEST), key=lambda a: a.video_id)
-    for encoder in sorted({*params.ablation.encoders} - {Encoder.WORDS}):
+    for encoder in sorted(params.ablation.encoders):
         folder = root / layout.embeddings_dir(encoder, seed)
         if len(tested) > 1 and (folder / TENSOR_FILE).is_file():
             maps.append(map_frame(means(folder, tested), tested, catalogue).assign(encoder=str(encoder)))

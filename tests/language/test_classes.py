@@ -1,4 +1,4 @@
-"""Classes read from logits, held against the rules as reports grade them, and told in words."""
+"""Classes read from logits, held against the rules as reports grade them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy.special import softmax
 from pipeline.core.records import Part, Question
 from pipeline.encoder.records import Classification
 from pipeline.evaluation.grading import conclude
-from pipeline.language.classes import in_words, uncontradicted
+from pipeline.language.classes import uncontradicted
 from pipeline.tasks.questions import build_questions
 from pipeline.training.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
 from tests.language.conftest import write_store
@@ -73,23 +73,3 @@ def test_comparisons_stay_that_follow_from_the_logits_by_rule(
     counts = {task: sum(q.task == task for q in kept) for task in ASKED}
     assert counts["OPD"] == 20
     assert all(10 < counts[task] < ASKED[task] - 10 for task in ("PC", "PSS", "POM")), counts
-
-
-def test_in_words_each_video_is_what_its_heads_say(
-    questions: list[Question], logits: dict[str, torch.Tensor], store: EmbeddingStore
-) -> None:
-    told = in_words(questions, store, CATALOGUE)
-    assert [q.question_id for q in told] == [q.question_id for q in questions]
-    for before, after in zip(questions, told, strict=True):
-        assert after.videos == (), "no embedding is read"
-        words = []
-        for video in before.videos:
-            found = [shares(logits[video], place) for place in range(3)]
-            levels = [p.levels[s.index(max(s))] for p, s in zip(CATALOGUE.properties, found, strict=True)]
-            words.append(f"({', '.join(levels)})")
-        for own, other in zip(before.dialogues, after.dialogues, strict=True):
-            for asked, said in zip(own.turns, other.turns, strict=True):
-                assert said == asked.model_copy(update={"user": said.user}), "answers stay"
-            text, given = (" | ".join(turn.user for turn in d.turns) for d in (own, other))
-            assert text.count("{tactile}") == len(words)
-            assert given == text.replace("{tactile}", "{}").format(*words)
