@@ -116,6 +116,19 @@ def test_no_scale_is_chosen_while_a_stage_runs(here: Path) -> None:
     assert running_stages() == []
 
 
+def test_a_run_that_trains_nothing_leaves_folders_that_are_not_empty(here: Path) -> None:
+    params = compose("smoke", ["kernels=machine", "ablation.train=false"], conf=ROOT / "conf")
+    write_params(params, here / "params.yaml")
+    (here / "dvc.yaml").write_bytes((ROOT / "dvc.yaml").read_bytes())
+    for name, key in (("embed", None), ("align", "base-all-0"), ("answer", "base-with-all-0")):
+        with pytest.raises(SystemExit) as ended, stage(name, key, of_variants=True):
+            pytest.fail("it went on")
+        assert not ended.value.code
+    made = {file.parent.relative_to(here / "data").as_posix() for file in (here / "data").rglob("not_trained")}
+    encoders = {"embeddings/finetuned-0", "embeddings/base-0"}
+    assert made == {*encoders, "models/without/base-all-0", "answers/base-with-all-0"}
+
+
 @pytest.fixture
 def clone(tmp_path: Path) -> Path:
     """As much of another clone, in a path with a space, as a check of the folder looks at."""

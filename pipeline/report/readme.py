@@ -42,8 +42,9 @@ def sections(report: Report) -> dict[str, Any]:
         beside; `stands_on`, what a figure is worth: models with their size, test objects, seeds; `beyond`, the settings
         that its last fact counts; `origin`: command, hash of the code, data, models by hash, packages.
     """
-    said, tasks, shipped = report.provenance, FIVE_TASKS.block(report), SHIPPED_TABLE.block(report)
+    said, shipped = report.provenance, SHIPPED_TABLE.block(report)
     trained = bool(said["base_models"])
+    tasks = FIVE_TASKS.block(report) if trained else None
     if trained and shipped:  # The paper's figures stand beside the models of this run.
         shipped.frame.drop(columns=[c for c in shipped.frame if c.startswith("Published")], inplace=True)
     if tasks:

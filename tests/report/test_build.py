@@ -217,3 +217,27 @@ def test_the_shipped_models_answers_come_first_and_the_plumbing_is_folded(tmp_pa
     order = [page.index(f'id="{params.report_name}-{part}"') for part in ("shipped", "tasks", "stands-on")]
     assert order == sorted(order)
     assert "75.0 [" in page[order[0] : order[1]]
+
+
+def test_a_run_that_trains_nothing_reports_models_that_were_trained_before(tmp_path: Path) -> None:
+    """With sets of different questions, whose accuracies stand beside the interval over all of them."""
+    only = ("ablation.train=false", "questions.evaluation={opd:0,pc:4,pss:0,pom:0,psr:0}")
+    params = write_run(tmp_path, fake_params(*ONE, *only))
+    common = {"measure": "choice", "parsed": True, "truncated": False, "expected": "yes", "predicted": "yes"}
+    said = {"task": "PC", "model": "octopi-7b", "shown": Shown.TOUCH, **common}
+    rows = [
+        GradedVision(question_id=f"PC-{i}-{s}", correct=i < 20 + 5 * s, objects=(f"o{i}", f"p{i}"), seed=s, **said)
+        for i in range(40)
+        for s in range(3)
+    ]
+    write_table(tmp_path / "data" / "evaluated.parquet", GradedVision, rows)
+    assert write_report(params, tmp_path) == {"octopi-7b_PC": 0.625}
+    text = (tmp_path / "reports" / params.report_name / "README.md").read_text()
+    assert "| octopi-7b, as it is | 62.5 [" in text
+    assert "| 120 (40) | 50.0 to 75.0 (3) |" in text
+    assert "48.10 (~158)" in text, "published beside"
+    assert "full system" not in text
+    assert "Language model:" not in text
+    page = write_page(tmp_path).read_text()
+    assert "62.5 [" in page
+    assert f'id="{params.report_name}-tasks"' not in page

@@ -20,6 +20,7 @@ from pipeline.cli import app
 from pipeline.config import LANGUAGE_DIR
 from pipeline.core.io import read_json, read_table, write_table
 from pipeline.core.layout import SHIPPED
+from pipeline.core.records import Part
 from pipeline.evaluation.records import GradedVision, Shown
 from pipeline.evaluation.rows import ALL_SEEDS
 from pipeline.language.base import ADAPTER_CONFIG, ADAPTER_WEIGHTS
@@ -33,7 +34,7 @@ from pipeline.use.evaluate import answers_about
 from pipeline.use.folder import Base, find_base, read_folder
 from pipeline.use.model import Octopi
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.records import Video
+from pipeline.videos.records import Assignment, Video
 from tests.checkpoints import edit
 from tests.closure import ROOT
 from tests.conftest import fake_videos, refused
@@ -145,7 +146,12 @@ def test_a_runs_videos_are_asked_about_as_they_are_and_standardised(
 ) -> None:
     """What it says of them is what it says to a person who asks; an object that it was trained on stops the stage."""
     changed = ["data.source=videos", f"data.dir={EXAMPLES}", f"data.catalogue={ROOT}/pipeline/physiclear"]
-    few = ["kernels=machine", "evaluate.questions=4", "questions.evaluation={opd:9,pc:9,pss:0,pom:9,psr:0}"]
+    few = [
+        "kernels=machine",
+        "evaluate.questions=4",
+        "evaluate.repeats=2",
+        "questions.evaluation={opd:9,pc:9,pss:0,pom:9,psr:0}",
+    ]
     write_params(compose("smoke", [*changed, *few], ROOT / "conf"), tmp_path / "params.yaml")
     monkeypatch.chdir(tmp_path)
     # Two threads of each of two test processes would wait for each other on two cores.
@@ -155,6 +161,8 @@ def test_a_runs_videos_are_asked_about_as_they_are_and_standardised(
         videos = fake_videos(objects, per_object=1)
         videos = [v.model_copy(update={"path": f"{objects[v.object_id]}.mp4"}) for v in videos]
         write_table(tmp_path / "data" / "videos.parquet", Video, videos)
+        unused = [Assignment(video_id=v.video_id, object_id=v.object_id, part=Part.UNUSED) for v in videos]
+        write_table(tmp_path / "data" / "splits" / "0.parquet", Assignment, unused)
         runpy.run_path(str(ROOT / "stages" / "evaluate.py"), run_name="__main__")
         return read_table(tmp_path / "data" / "evaluated.parquet", GradedVision)
 
@@ -162,7 +170,9 @@ def test_a_runs_videos_are_asked_about_as_they_are_and_standardised(
     graded = run(objects)
     ways = {way: [(r.question_id, r.measure) for r in graded if r.shown is way] for way in Shown}
     assert ways[Shown.TOUCH] == ways[Shown.STANDARDISED] == ways[Shown.CLASSES]
-    asked = {r.question_id: r.task for r in graded}
+    sets = [{r.question_id for r in graded if r.seed == seed} for seed in (0, 1)]
+    assert len(sets[0]) == len(sets[1]) == len(sets[0] | sets[1]) / 2, "no question of one set is in the other"
+    asked = {r.question_id: r.task for r in graded if r.seed == 0}
     assert Counter(asked.values()) == {"OPD": 2, "PC": 1, "POM": 1}, "half of them describe"
     assert all(r.parsed for r in graded if r.task == "POM"), "it is asked under names as in training"
     said = dict(zip(objects, octopi.describe_all([EXAMPLES / f"{v}.mp4" for v in objects.values()]), strict=True))

@@ -1,0 +1,76 @@
+"""Questions that others answer: what is exported, what is taken back, and what it says in a report."""
+
+from __future__ import annotations
+
+import json
+import runpy
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from pipeline.cli import app
+from pipeline.core.io import read_jsonl
+from pipeline.core.layout import questions_file
+from pipeline.core.records import Opd, Question
+from pipeline.report.load import load_report
+from pipeline.tasks import TASKS
+from tests.closure import ROOT
+from tests.conftest import refused
+from tests.fake_run import fake_params, write_run
+
+FEW = ("ablation.encoders=[finetuned]", "ablation.touch=[]", "questions.evaluation={opd:4,pc:4,pss:4,pom:4,psr:4}")
+
+
+def questions(*arguments: str) -> str:
+    return CliRunner().invoke(app, ["questions", *arguments], catch_exceptions=False).output
+
+
+@pytest.mark.slow
+def test_right_answers_are_right_and_no_answer_leaves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    params = write_run(tmp_path, fake_params(*FEW))
+    assert "questions" in questions("export", "asked.jsonl")
+    asked = [json.loads(line) for line in Path("asked.jsonl").read_text().splitlines()]
+    built = {q.question_id: q for q in read_jsonl(questions_file(0), Question)}
+    assert [row["id"] for row in asked] == [*built]
+    told = []
+    for row in asked:
+        dialogue = built[row["id"]].dialogue(Opd.ALL)
+        assert dialogue
+        assert row.keys() == {"id", "task", "turns", "videos"}
+        assert row["turns"] == [turn.user for turn in dialogue.turns]
+        assert sum(turn.count("{tactile}") for turn in row["turns"]) == len(row["videos"])
+        assert not any(turn.assistant in json.dumps(row) for turn in dialogue.turns)
+        told.append({"id": row["id"], "text": dialogue.turns[-1].assistant})
+    Path("told.jsonl").write_text("\n".join(map(json.dumps, told)))
+    assert f"{len(built)} answers" in questions("grade", "told.jsonl", "--name", "their-model")
+    for stage in ("grade", "report"):
+        runpy.run_path(str(ROOT / "stages" / f"{stage}.py"), run_name="__main__")
+    report = load_report(Path("reports") / params.report_name)
+    rows = report.scores.query("encoder == 'their-model' and seed == 'all'")
+    whole = rows[[m == TASKS[t].measure for t, m in zip(rows["task"], rows["measure"], strict=True)]]
+    assert set(whole["task"]) == {q.task for q in built.values()}
+    assert (rows["accuracy"] == 1).all()
+    assert "| their-model, answered outside this project |" in (report.folder / "README.md").read_text()
+
+    def wrong(*lines: object) -> None:
+        text = "\n".join(line if isinstance(line, str) else json.dumps(line) for line in lines)
+        Path("wrong.jsonl").write_text(text)
+        questions("grade", "wrong.jsonl", "--name", "other")
+
+    with refused(f"{told[-1]['id']} has no answer (1 question in all)"):
+        wrong(*told[:-1])
+    with refused("line 2", f"{told[0]['id']} is answered twice"):
+        wrong(told[0], told[0])
+    with refused("PC-none is none of this run's questions"):
+        wrong(*told, {"id": "PC-none", "text": ""})
+    with refused("line 1", "write id and text"):
+        wrong("yes")
+    with refused("3 texts for"):
+        wrong({**told[0], "text": ["a", "b", "c"]}, *told[1:])
+    with refused("--name a/b"):
+        questions("grade", "told.jsonl", "--name", "a/b")
+    with refused("nowhere.jsonl: cannot be read"):
+        questions("grade", "nowhere.jsonl", "--name", "other")
+    assert [folder.name for folder in Path("external", params.report_name).iterdir()] == ["their-model"]
