@@ -35,7 +35,7 @@ def test_shipped_scale_is_valid_and_survives_writing(scale: str, tmp_path: Path)
 def test_a_new_scale_is_a_file(tmp_path: Path) -> None:
     conf = shutil.copytree(CONF, tmp_path / "conf")
     (conf / "lab.yaml").write_text("defaults: [small, _self_]\nscale: lab\nlora: {rank: 4}\n")
-    names = "finetune, invented, lab, paper-13b, paper-7b, rehearsal, small, smoke"
+    names = "evaluate, finetune, invented, lab, paper-13b, paper-7b, rehearsal, small, smoke"
     assert ", ".join(scale_names(conf)) == names
     params = compose("lab", conf=conf)
     assert (params.scale, params.lora.rank, params.report_name) == ("lab", 4, "lab-scenes")

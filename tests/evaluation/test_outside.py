@@ -59,7 +59,7 @@ def test_right_answers_are_right_and_no_answer_leaves(tmp_path: Path, monkeypatc
         Path("wrong.jsonl").write_text(text)
         questions("grade", "wrong.jsonl", "--name", "other")
 
-    with refused(f"{told[-1]['id']} has no answer (1 question in all)"):
+    with refused(rf"{told[-1]['id']} has no answer \(1 question in all"):
         wrong(*told[:-1])
     with refused("line 2", f"{told[0]['id']} is answered twice"):
         wrong(told[0], told[0])
