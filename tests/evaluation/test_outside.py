@@ -61,11 +61,11 @@ def test_right_answers_are_right_and_no_answer_leaves(tmp_path: Path, monkeypatc
 
     with refused(rf"{told[-1]['id']} has no answer \(1 question in all"):
         wrong(*told[:-1])
-    with refused("line 2", f"{told[0]['id']} is answered twice"):
+    with refused(f"line 2: {told[0]['id']} is answered twice"):
         wrong(told[0], told[0])
     with refused("PC-none is none of this run's questions"):
         wrong(*told, {"id": "PC-none", "text": ""})
-    with refused("line 1", "write id and text"):
+    with refused("line 1: .*write id and text"):
         wrong("yes")
     with refused("3 texts for"):
         wrong({**told[0], "text": ["a", "b", "c"]}, *told[1:])
