@@ -28,8 +28,7 @@ from pipeline.encoder import finetune as module
 from pipeline.encoder.data import ClipDataset, EncoderData, LabelledVideo
 from pipeline.encoder.embed import logits_of, standardize, statistics, union
 from pipeline.encoder.finetune import accuracies, finetune, train_classifier, write_encoder_card
-from pipeline.encoder.folds import deal
-from pipeline.encoder.frame_classifier import STRENGTHS
+from pipeline.encoder.frame_classifier import STRENGTHS, deal
 from pipeline.encoder.model import Heads, PropertyClassifier
 from pipeline.encoder.recipes import property_classifier
 from pipeline.encoder.scene_encoder import SceneEncoder

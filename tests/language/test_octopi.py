@@ -149,6 +149,10 @@ def without_first(file: Path) -> None:
     save_file(dict(rest), file, {"format": "pt"})
 
 
+def foreign(file: Path) -> None:
+    save_file({name: torch.zeros(1) for name in load_file(file)}, file)
+
+
 def not_finite(file: Path) -> None:
     name, value = max(load_file(file).items())
     replace(file, name, torch.full_like(value, float("nan")))
@@ -159,6 +163,7 @@ BROKEN: list[tuple[str, Callable[[Path], object], str]] = [
     (ADAPTER, pickled, r"adapter_model.safetensors: no such file \(pickled adapters are refused\)"),
     (ADAPTER, without_first, "its adapter is broken or of another language model .*layers.0.self_attn.k_proj"),
     (CONNECTOR, lambda file: torch.save({}, file), "not a safetensors file"),
+    (CONNECTOR, foreign, "does not fit the model"),
     (CONNECTOR, not_finite, "connector.* is not finite"),
     (WORDS, not_finite, "words.weight is not finite; lower the learning rate"),
 ]
