@@ -14,8 +14,7 @@ import torch
 from benchmarks.table import Error, share_of
 from pipeline.config import EncoderConfig
 from pipeline.core.runtime import derive_seed
-from pipeline.encoder.folds import Labels, deal
-from pipeline.encoder.frame_classifier import Clips, choose_strength, fit_frame_heads
+from pipeline.encoder.frame_classifier import Clips, Labels, choose_strength, deal, fit_frame_heads
 from pipeline.encoder.model import FrameEncoder, load_backbones
 from pipeline.videos.catalogue import Catalogue
 from pipeline.weights.make import make

@@ -16,8 +16,7 @@ from pipeline.config import EncoderConfig
 from pipeline.core.records import Embedding, Flip, Part
 from pipeline.core.runtime import DeviceName, derive_seed, resolve_device
 from pipeline.encoder.data import AXES
-from pipeline.encoder.folds import Labels, deal
-from pipeline.encoder.frame_classifier import FOLDS, Clips, choose_strength, fit_frame_heads
+from pipeline.encoder.frame_classifier import FOLDS, Clips, Labels, choose_strength, deal, fit_frame_heads
 from pipeline.encoder.model import FrameEncoder
 from pipeline.encoder.recipes import base_encoder, property_classifier
 from pipeline.running.errors import UserError

@@ -18,7 +18,6 @@ import torch
 
 from pipeline.core.records import Measurement
 from pipeline.core.runtime import derive_seed
-from pipeline.encoder.folds import Labels, deal
 from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
 from pipeline.running.errors import UserError
 
@@ -39,6 +38,8 @@ MOST_COMBINATIONS = 100_000
 Probabilities = npt.NDArray[np.float64]
 Clips = npt.NDArray[np.float32]
 """Videos x frames x features."""
+Labels = npt.NDArray[np.int64]
+"""Videos x properties: classes from 0."""
 
 
 class JointFrameClassifier(PropertyClassifier):
@@ -169,6 +170,16 @@ def choose_strength(
         reached.append(float(right.mean()))
     curve = [Measurement(step=i, name="inner_combined", value=value) for i, value in enumerate(reached)]
     return STRENGTHS[int(np.argmax(reached))], curve
+
+
+def deal(objects: Sequence[str], folds: int, seed: int) -> list[frozenset[str]]:
+    """Deal the distinct objects, shuffled, into folds whose numbers of objects differ by at most one.
+
+    All videos of an object are in one fold, as they look alike.
+    """
+    names = sorted(set(objects))
+    order = np.random.default_rng(seed).permutation(len(names))
+    return [frozenset(names[i] for i in order[fold::folds]) for fold in range(folds)]
 
 
 def log_dependence(labels: Labels, objects: Sequence[str], classes: Sequence[int]) -> Probabilities:

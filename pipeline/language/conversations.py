@@ -11,7 +11,7 @@ from torch.nn.utils.rnn import pad_sequence
 from torch.utils.data import Sampler
 from transformers import PreTrainedTokenizerBase
 
-from pipeline.config import ChatFormat
+from pipeline.config import LanguageConfig
 from pipeline.core.records import Opd, Question
 from pipeline.core.runtime import derive_seed
 from pipeline.language.chat import IGNORE_INDEX, conclusions, encode, render
@@ -42,14 +42,12 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         opd: Opd,
         store: EmbeddingStore,
         tokenizer: PreTrainedTokenizerBase,
+        language: LanguageConfig,
         *,
-        system_prompt: str,
-        chat: ChatFormat = "template",
         per_video: int,
         flip_probability: float,
         seed: int,
         positions: int | None,
-        bos: bool = True,
         given: Collection[str] = (),
         by_question: bool,
     ) -> None:
@@ -61,14 +59,15 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         self.written: list[dict[str, torch.Tensor]] = []
         """The tensors of each question that are the same in every epoch."""
         for question, dialogue in asked:
+            system, chat = language.system_prompt, language.chat
             rendered = render(
-                dialogue.turns, tokenizer, system_prompt=system_prompt, frames=per_video, complete=True, chat=chat
+                dialogue.turns, tokenizer, system_prompt=system, frames=per_video, complete=True, chat=chat
             )
-            encoded = encode(rendered, tokenizer, bos=bos)
+            encoded = encode(rendered, tokenizer, bos=language.bos)
             check_length(question.question_id, len(encoded.input_ids), positions)
             learnt = encoded.labels
             if question.question_id in given:
-                learnt = encode(conclusions(rendered, dialogue.turns), tokenizer, bos=bos).labels
+                learnt = encode(conclusions(rendered, dialogue.turns), tokenizer, bos=language.bos).labels
             # Given descriptions keep their labels; their weight of 0 leaves them out of the loss.
             weights = (torch.tensor(learnt) != IGNORE_INDEX).float()
             if by_question:

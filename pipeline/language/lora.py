@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from torch import nn
-from transformers import PreTrainedModel
 
 from pipeline.config import LoraTrainConfig
 from pipeline.language.octopi import OctopiForCausalLM
@@ -16,13 +15,19 @@ def add_lora(model: OctopiForCausalLM, config: LoraTrainConfig) -> None:
     Layers that it lacks, or an adapter of another shape, are a UserError.
     """
     from peft import LoraConfig, PeftModel, get_peft_model
+    from peft.tuners.tuners_utils import BaseTunerLayer
 
     if isinstance(model.llm, PeftModel):
         own = model.llm.peft_config["default"]
         for name, value in {"rank": own.r, "alpha": own.lora_alpha, "dropout": own.lora_dropout}.items():
             if value != getattr(config, name):
                 raise UserError(f"lora.{name}: the adapter to train on has {value}; set lora.{name}={value}")
-        has, every = _layers(model.llm.get_base_model())
+        # The layers that bear an adapter, and those of `all-linear`: all but the one that says words.
+        base = model.llm.get_base_model()
+        last, whole = base.get_output_embeddings(), [each for each in base.named_modules() if ".lora_" not in each[0]]
+        layers = [(name.removesuffix(".base_layer").rsplit(".", 1)[-1], module) for name, module in whole]
+        has = {name for name, layer in layers if isinstance(layer, BaseTunerLayer)}
+        every = {name for name, layer in layers if isinstance(layer, nn.Linear) and layer is not last}
         if has != (every if config.target_modules == "all-linear" else set(config.target_modules)):
             own = "all-linear" if has == every else f"[{','.join(sorted(has))}]"
             raise UserError(f"lora.target_modules: the adapter to train on has {own}; set lora.target_modules={own}")
@@ -37,14 +42,3 @@ def add_lora(model: OctopiForCausalLM, config: LoraTrainConfig) -> None:
         raise UserError(f"lora.target_modules: the language model has no layer {unknown[0]}; it has {linear}")
     shape = {"r": config.rank, "lora_alpha": config.alpha, "lora_dropout": config.dropout}
     model.llm = get_peft_model(model.llm, LoraConfig(**shape, target_modules=modules, task_type="CAUSAL_LM"))
-
-
-def _layers(llm: PreTrainedModel) -> tuple[set[str], set[str]]:
-    """The layers that bear an adapter, and those of `all-linear`: all but the one that says words."""
-    from peft.tuners.tuners_utils import BaseTunerLayer
-
-    whole = [(name.removesuffix(".base_layer"), m) for name, m in llm.named_modules() if ".lora_" not in name]
-    layers = [(name.rsplit(".", 1)[-1], module) for name, module in whole]
-    last = llm.get_output_embeddings()
-    adapted = {name for name, layer in layers if isinstance(layer, BaseTunerLayer)}
-    return adapted, {name for name, layer in layers if isinstance(layer, nn.Linear) and layer is not last}

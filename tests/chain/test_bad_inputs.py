@@ -78,7 +78,7 @@ COMMANDS = {
     "scale smoke align.batch_size=10": "align.*does not divide",
     "scale smoke justaword": "key=value",
     """scale smoke "split.name='Side ways'" """: "split.name.*Side ways.*pattern",
-    "stages/align.py nonsense all 0": "'nonsense'; usage: stages/align.py {finetuned,base,words} {none",
+    "stages/align.py nonsense all 0": "'nonsense'; usage: stages/align.py {finetuned,base} {none",
     "stages/lora.py finetuned all": "seed; usage: stages/lora.py",
     "stages/finetune_encoder.py two": "'two'; usage: stages/finetune_encoder.py seed",
     **dict.fromkeys((f"stages/{stage}" for stage in STAGES), NOT_THERE),

@@ -20,8 +20,7 @@ from pipeline.core.records import Part
 from pipeline.encoder import frame_classifier
 from pipeline.encoder.data import EncoderData
 from pipeline.encoder.finetune import finetune
-from pipeline.encoder.folds import deal
-from pipeline.encoder.frame_classifier import STRENGTHS, JointFrameClassifier, choose_strength, fit_frame_heads
+from pipeline.encoder.frame_classifier import STRENGTHS, JointFrameClassifier, choose_strength, deal, fit_frame_heads
 from pipeline.encoder.model import FrameEncoder
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore

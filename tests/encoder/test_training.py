@@ -5,11 +5,9 @@ from __future__ import annotations
 import hashlib
 import itertools
 import random
-import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, Literal
 
 import numpy as np
@@ -30,14 +28,13 @@ from pipeline.encoder import finetune as module
 from pipeline.encoder.data import ClipDataset, EncoderData, LabelledVideo
 from pipeline.encoder.embed import logits_of, standardize, statistics, union
 from pipeline.encoder.finetune import accuracies, finetune, train_classifier, write_encoder_card
-from pipeline.encoder.folds import deal
-from pipeline.encoder.frame_classifier import STRENGTHS
+from pipeline.encoder.frame_classifier import STRENGTHS, deal
 from pipeline.encoder.model import Heads, PropertyClassifier
-from pipeline.encoder.recipes import RECIPES, base_encoder, property_classifier
+from pipeline.encoder.recipes import property_classifier
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.training.embeddings import Statistics
 from pipeline.training.sampling import sample_evaluation, sample_training
-from pipeline.training.trainable import load_trainable, save_trainable, trainable_state
+from pipeline.training.trainable import load_trainable, trainable_state
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
 from pipeline.videos.records import Assignment
@@ -212,25 +209,6 @@ def test_validation_counts_videos_that_are_right_in_everything(catalogue: Catalo
     found = accuracies(logits, np.array([[0, 1, 2], [1, 0, 1], [1, 2, 1]]), decide, catalogue)
     expected = {"hardness": 2 / 3, "roughness": 1, "bumpiness": 2 / 3, "combined": 1 / 3}
     assert found == pytest.approx({f"validation_{name}": value for name, value in expected.items()})
-
-
-@pytest.mark.slow
-def test_a_recipe_is_a_module_and_a_line(
-    weights: Path, data: EncoderData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It trains, is saved and loaded, and embeds, without another change."""
-    recipe = SimpleNamespace(
-        base_encoder=lambda _: SceneEncoder(),
-        property_classifier=lambda _, classes: PropertyClassifier(SceneEncoder(), Heads(256, classes), classes),
-    )
-    monkeypatch.setitem(sys.modules, "toy_recipe", recipe)  # type: ignore[misc]
-    monkeypatch.setitem(RECIPES, "toy", "toy_recipe")
-    setting = config(weights, "toy", epochs=1)
-    model, history = finetune(training(data, setting))
-    assert "validation_combined" in {m.name for m in history}
-    save_trainable(model, tmp_path / "toy.safetensors")
-    load_trainable(property_classifier(setting, data.classes), tmp_path / "toy.safetensors")
-    assert base_encoder(setting).dim == 256
 
 
 def test_the_card_names_weights_by_hash_data_and_settings(weights: Path, data: EncoderData, tmp_path: Path) -> None:

@@ -206,19 +206,6 @@ def pretrained(steps: int, saved: int, objects: int = 16, side: int = 16) -> tup
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("noise")
-def test_a_killed_pretraining_ends_as_if_it_had_not_been(before_updates: Hook) -> None:
-    """15 objects make four updates an epoch: it is killed in the first (after a checkpoint at 2), and in the second."""
-
-    def run() -> tuple[list[Measurement], State]:
-        history, encoder = pretrained(8, 2)
-        return history, trainable_state(encoder)
-
-    # Four updates are begun before the first kill, and five more (from the third on) before the second.
-    assert updates_of_killed(run, [3, 8], [2, 6], before_updates) == 4 + 5 + 2
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("noise")
 def test_what_diverges_between_two_reports_replaces_no_good_checkpoint(tmp_path: Path, before_updates: Hook) -> None:
     """Reports come every second update, checkpoints after each."""
 
@@ -245,16 +232,6 @@ def test_a_tiny_pretraining_draws_trains_and_tells_what_it_left_aside() -> None:
     assert all(v.isfinite().all() for v in trainable_state(encoder).values())
     counts = [int(b) for n, b in encoder.named_buffers() if n.endswith("num_batches_tracked")]
     assert counts == [4] * len(CHANNELS), "the object left aside has touched no statistics"
-
-
-@pytest.mark.usefixtures("noise")
-def test_other_code_does_not_go_on_with_a_pretraining(versions: Callable[[str], None], begun_in: Begun) -> None:
-    places = [begun_in(lambda: pretrained(4, 2))]
-    for file in ("report/build.py", "training/trainer.py", "encoder/model.py", "encoder/pretrain.py"):
-        versions(f"pipeline/{file}")
-        places.append(begun_in(lambda: pretrained(4, 2)))
-    assert places[0] == places[1], "it does not depend on reports"
-    assert len(set(places)) == 4
 
 
 def test_a_training_goes_on_only_with_its_own_settings_labels_and_objects(

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from pipeline.scenes.geometry import IMAGE_MM, Bar, Round, Wedge, heights
 from pipeline.scenes.grid import Grid
-from pipeline.scenes.relief import Rough
 
 PITCH = IMAGE_MM[0] / 160
 
@@ -40,11 +39,3 @@ def test_a_wedge_is_round_on_top_and_straight_far_from_it() -> None:
     assert np.diff(wedge, 2)[799] / 0.025**2 == pytest.approx(-1 / tip, rel=0.02)
     assert np.diff(wedge)[-1] / 0.025 == pytest.approx(-slope, rel=0.01)
     np.testing.assert_allclose(wedge, wedge[::-1], atol=1e-6)
-
-
-def test_layers_add_up_in_order() -> None:
-    coarse, fine = Rough(rms=0.05, longest=3), Rough(rms=0.01, longest=0.8)
-    ball = Round(radii=(20, 30))
-    whole = heights(ball, (coarse, fine), 90, PITCH, np.random.default_rng(5))
-    rng, grid = np.random.default_rng(5), Grid(90, PITCH)
-    np.testing.assert_allclose(whole, ball.sample(grid) + coarse.sample(grid, rng) + fine.sample(grid, rng), atol=1e-6)

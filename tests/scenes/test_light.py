@@ -36,24 +36,6 @@ def test_flat_skin_is_the_background_within_the_noise(seed: int) -> None:
     np.testing.assert_array_equal(shade(FLAT, quiet(sensor), PITCH, 7), cv2.convertScaleAbs(sensor.glow))
 
 
-@pytest.mark.parametrize("curvature", [0.01, 0.05, 0.2])
-def test_lambert_on_a_paraboloid(curvature: float) -> None:
-    """Against unit normals and light vectors in float64, where a light's vector is (-g / D, 1) in any length."""
-    sensor = quiet(make_sensor(WIDTH, HEIGHT, 2))
-    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64) * PITCH
-    x, y = x - x.mean(), y - y.mean()
-    skin = 3 - curvature * (x * x + 0.5 * x * y + 2 * y * y)
-    normals = np.stack([curvature * (2 * x + 0.5 * y), curvature * (0.5 * x + 4 * y), np.ones_like(x)], axis=-1)
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    expected = sensor.glow.astype(np.float64) - np.stack(sensor.direct, axis=-1)
-    for channel, (across, along) in enumerate(sensor.gains):
-        vector = np.stack([-across, -along, sensor.direct[channel]], axis=-1).astype(np.float64)
-        expected[..., channel] += np.maximum((vector * normals).sum(axis=-1), 0)
-    frame = shade(skin.astype(np.float32), sensor, PITCH, 0)
-    inner = (slice(1, -1), slice(1, -1))  # Differences at the border are one-sided.
-    assert np.abs(frame[inner] - np.clip(expected, 0, 255)[inner]).max() < 0.51, "rounding to 8 bits"
-
-
 def test_red_comes_from_above_green_from_the_right_blue_from_below() -> None:
     """As in the real videos: a bulge's upper flank is redder than flat skin, its lower flank bluer."""
     sensor = quiet(make_sensor(WIDTH, HEIGHT, 0))

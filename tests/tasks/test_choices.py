@@ -47,10 +47,6 @@ def test_no_setting_of_the_recipe_is_left_out() -> None:
 SOURCE = ROOT.parent / "shared" / "paper" / "octopi.tex"
 TEX = SOURCE.read_text(encoding="utf-8") if SOURCE.is_file() else ""
 beside = pytest.mark.skipif(not TEX, reason="needs the paper's source")
-QUOTED = """Soft & 26; Moderately hard & 14; Hard & 34; Smooth & 36; Slightly rough & 16; Rough & 22; No bumps & 26;
-Small bumps & 34; Big bumps & 14; 0.894 (hardness), 0.979 (roughness), and 0.792; over 1,200; top 30%; selected 5;
-attach 8; for 30 epochs; size of 32; rate of 1e-3; 0 weight decay, a; using 8,000; using 3,000; size of 16; of 2e-5, b;
-and 2e-4; 0 weight decay, b; factor of 256, a rank of 128, and a dropout rate of 0.05; PC & 33.33; on 500"""
 
 
 def plain(text: str) -> str:
@@ -68,16 +64,8 @@ def table(label: str) -> list[tuple[str, ...]]:
 
 
 @beside
-def test_numbers_in_the_column_paper_are_the_papers() -> None:
-    assert hashlib.sha256(TEX.encode()).hexdigest().startswith("da5a076f847d99d30761cdcae99b10f0"), "another version"
-    quoted, number = " ".join(QUOTED.split()), r"\d[\d,.]*\b(?:e-\d)?"
-    assert [words for words in quoted.split("; ") if words not in plain(TEX)] == []
-    # In the table's order. Those of its last row, a third and 1/27, are printed in percent.
-    assert [n for row in ROWS[:-1] for n in re.findall(number, row["Paper"])] == re.findall(number, quoted)
-
-
-@beside
 def test_published_csv_is_every_figure_of_the_papers_tables() -> None:
+    assert hashlib.sha256(TEX.encode()).hexdigest().startswith("da5a076f847d99d30761cdcae99b10f0"), "another version"
     found, systems = set(), list[str]()
     for place in re.findall(r"label\{table:(\w+)", TEX)[5:13]:  # The tables of results.
         for name, *cells in table(place):

@@ -62,14 +62,10 @@ LLAMA: list[Damage] = [
     (lambda f: (f / "tokenizer.json").write_text(""), "tokenizer.json is no fast tokenizer"),
     NO_WIDTH,
     (lambda f: cut(f / ONE), "model.safetensors is cut off or not a safetensors file .*; download it"),
-    (lambda f: (f / ONE).write_text("version https://git-lfs"), "model.safetensors is cut off"),
     (lambda f: (f / ONE).rename(f / "pytorch_model.bin"), "only pickles"),
     (lambda f: (f / "tokenizer.json").unlink(), "tokenizer.json does not exist"),
     (lambda f: (f / "tokenizer_config.json").write_text("{"), "_config.json is not a JSON object"),
-    (lambda f: (f / "config.json").write_text("[]"), "/config.json is not a JSON object"),
     (lambda f: edit(f / "config.json", model_type=None), "cannot be loaded .*model_type"),
-    (lambda f: edit(f / "config.json", num_attention_heads=0), "cannot be loaded .*zero"),
-    (lambda f: edit(f / "config.json", intermediate_size=65), r"mlp.down_proj.weight is \[32, 64\], not .*; take"),
     (lambda f: without(f / ONE, "lm_head.weight"), "lm_head.weight is missing"),
     (other_vocabulary, "tokenizer.json has words up to number 259, but vocab_size of .*/config.json is 259"),
 ]
@@ -79,20 +75,16 @@ SHARDS: list[Damage] = [
     (lambda f: edit(f / INDEX, weight_map={}), "shards cannot be loaded"),
 ]
 CLIP: list[Damage] = [
-    (lambda f: cut(f / CLIP_FILE), "open_clip_model.safetensors is cut off"),
     NO_NUMBER,
-    (lambda f: vision(f, layers=3), 'Missing key.* "transformer.resblocks.2'),
     (lambda f: vision(f, width=48), "does not fit its open_clip_config.json .*mismatch for class_embedding"),
     (lambda f: vision(f, layers=[3, 4, 6, 3]), "is no vision transformer"),
     (lambda f: (f / CLIP_FORM).write_text("{}"), "open_clip_config.json"),
 ]
-NO_TIMM = "is no configuration of a timm backbone"
 TIMM: list[Damage] = [
     (lambda f: cut(f / ONE), "^encoder.weights: timm/model.safetensors is cut off"),
     (lambda f: (f / ONE).rename(f / "pytorch_model.bin"), "pickles are refused"),
     (lambda f: (f / "config.json").unlink(), "config.json does not exist; set encoder.weights=data/weights/"),
-    (lambda f: (f / "config.json").write_text("{}"), NO_TIMM),
-    (lambda f: (f / "config.json").write_text("[]"), NO_TIMM),
+    (lambda f: (f / "config.json").write_text("{}"), "is no configuration of a timm backbone"),
 ]
 
 
@@ -114,7 +106,7 @@ def test_what_can_be_made_or_is_not_read_need_not_be_there() -> None:
     check_encoder_files(Path("timm"), ("scenes",))
 
 
-NOT_MADE = "encoder.weights: data/weights/{} is none .* allowed below data/weights: {}"
+NOT_MADE = "encoder.weights: data/weights/tiny-llama is none .* allowed below data/weights: tiny-clip"
 MAKE = "data/weights/tiny-llama/config.json does not exist; `dvc repro weights` makes it"
 
 
@@ -123,12 +115,10 @@ MAKE = "data/weights/tiny-llama/config.json does not exist; `dvc repro weights` 
     [
         (lambda: check_recipe("papr"), r"^encoder.recipe: papr is no recipe; did you mean paper\? known: paper, "),
         (lambda: check_encoder(Path(), 32, ("tim",)), r"^encoder.backbone: tim .*; did you mean timm\? known: clip, "),
-        (lambda: check_encoder(MADE_DIR / "tiny-llama", 64, ("clip",)), NOT_MADE.format("tiny-llama", "tiny-clip")),
-        (lambda: check_encoder(MADE_DIR / "tiny-clip", 64, ("timm",)), NOT_MADE.format("tiny-clip", "efficientnet-")),
+        (lambda: check_encoder(MADE_DIR / "tiny-llama", 64, ("clip",)), NOT_MADE),
         (lambda: check_language(MADE_DIR / "gpt"), "language.weights: data/weights/gpt is none .* smollm2, tiny-llama"),
         (lambda: check_encoder(MADE_DIR / "tiny-clip", 63, ("clip",)), "set frames.pixels=64"),
         (lambda: check_encoder(write_clip(Path("c")), 24, ("clip",)), r"frames\.pixels is 24 .* frames\.pixels=32$"),
-        (lambda: check_encoder(write_clip(Path("c")), 32, ("clip", "timm")), "config.json does not exist"),
         (lambda: check_encoder(Path("nowhere"), 8, ("timm",)), "nowhere/config.json does not exist; set encoder.weigh"),
         (lambda: load_tokenizer(MADE_DIR / "tiny-llama"), MAKE),
         (lambda: load_llm(MADE_DIR / "tiny-llama", dtype=None), MAKE),
@@ -241,7 +231,6 @@ NO_FIT = r"^encoder.weights: \w+ does not fit its (open_clip_)?config.json"
         ("clip", lambda f: spoil(f, CLIP_FILE, f"visual.{MLP}"), f"{MLP} in clip/{CLIP_FILE} {NAN}"),
         ("clip", pickled, f"^encoder.weights: clip/{CLIP_FILE} does not exist; "),
         ("clip", lambda f: disguised(f / CLIP_FILE), NO_FIT),
-        ("clip", lambda f: vision(f, layers=3), NO_FIT),
         ("clip", lambda f: vision(f, unheard_of=1), NO_FIT),
         ("clip", lambda f: form_of_clip(f, "text_cfg", hf_model_name="roberta"), "open_clip would ask a hub"),
         ("timm", lambda f: spoil(f, ONE, RUNNING), f"{RUNNING} in timm/{ONE} {NAN}"),
