@@ -238,6 +238,24 @@ def video(
     typer.echo(f"{counted(len(written), 'video')} in {out}: {', '.join(path.name for path in written)}")
 
 
+@import_app.command()
+def lerobot(
+    dataset: Annotated[Path, typer.Argument(help="Folder of a LeRobot dataset, v3.0 or v2.1.")],
+    video: Annotated[str, typer.Option(help="Key of its tactile camera, such as observation.images.gelsight.")],
+    out: Out,
+    objects: Annotated[
+        Path | None, typer.Option(help="CSV of object_id and episode, or task; by default an object is called by it.")
+    ] = None,
+    pressed: Annotated[bool, typer.Option("--presses", help="Write each press as a video.")] = False,
+    times: Times = 4.0,
+) -> None:
+    """Make a video of each episode, where possible without encoding it anew, and a `videos.csv`."""
+    from pipeline.videos.importing.lerobot import import_episodes
+
+    written = import_episodes(dataset, video, out, objects, times, pressed=pressed)
+    typer.echo(f"{counted(len(written), 'new video')} in {out}: {', '.join(path.name for path in written)}")
+
+
 def _print_findings(findings: Sequence[Finding]) -> None:
     """Print an audit's findings; errors among them end the command with status 1."""
     for f in findings:

@@ -43,18 +43,20 @@ def watch(camera: str) -> Iterator[Shot]:
     capture = cv2.VideoCapture(int(camera) if camera.isdecimal() else camera)
     if not capture.isOpened():
         raise UserError(f"{camera}: no camera that opens; name an index (0 is the first), a file or an address")
-    missed = 0
+    came, missed = False, 0
     try:
         while missed < GONE:  # A camera may drop a frame and deliver the next one.
             good, picture = capture.read()
             now = time.monotonic_ns()
-            missed = 0 if good else missed + 1
+            came, missed = came or good, 0 if good else missed + 1
             if good:
                 yield Shot(np.asarray(picture, dtype=np.uint8), now, now)
             else:
                 time.sleep(PAUSE)
     finally:
         capture.release()
+    if not came:  # As with AV1, which OpenCV opens and does not decode.
+        raise UserError(f"{camera}: opens, but OpenCV reads no picture of it; send H.264 or MJPEG, or name a file")
     raise UserError(f"{camera}: brings no picture any more; is it connected?")
 
 

@@ -79,6 +79,10 @@ class FrameTime(Record):
     """Contact strength in 8-bit steps (`pipeline.videos.frames.reference.contact_strength`)."""
 
 
+class NothingTouchesError(UserError):
+    """A recording without a press."""
+
+
 @dataclass(frozen=True)
 class Shot:
     """One picture of a recording: height x width x BGR, and its times in ns."""
@@ -117,20 +121,20 @@ def cut(
         raise UserError(f"--object {object_id!r}: take letters, digits, _ and -, as in objects.csv")
     stamped, received, strengths = _measure(read())
     if len(received) < SHORTEST:
-        raise UserError(f"{name}: {len(received)} pictures are no press; record from before the contact to its end")
+        raise NothingTouchesError(
+            f"{name}: {len(received)} pictures are no press; record from before the contact to its end"
+        )
     ranges = [(0, len(strengths))] if whole else presses(strengths, times)
     if not ranges:
-        raise UserError(
+        raise NothingTouchesError(
             f"{name}: nothing touches the sensor in {len(strengths)} pictures (strongest difference "
             f"{strengths.max():.2f}, a press begins at {_threshold(strengths, times):.2f}); lower --times"
         )
     fps = _rate(name, stamped, received)
     out.mkdir(parents=True, exist_ok=True)
     remove_rests(out)
-    taken = [re.fullmatch(rf"{re.escape(object_id)}_(\d+)", path.stem) for path in out.iterdir() if is_video(path)]
-    first = max((int(match[1]) + 1 for match in taken if match), default=0)
     source, position, written = read(), 0, []
-    for number, (begin, end) in enumerate(ranges, first):
+    for number, (begin, end) in enumerate(ranges, first_free(out, object_id)):
         path = out / f"{object_id}_{number}.mp4"
         pressed = itertools.islice(source, begin - position, end - position)
         position = end
@@ -150,6 +154,12 @@ def cut(
             part.unlink(missing_ok=True)
         written.append(path)
     return written
+
+
+def first_free(out: Path, object_id: str) -> int:
+    """The number behind the last one that a folder has of an object."""
+    taken = [re.fullmatch(rf"{re.escape(object_id)}_(\d+)", path.stem) for path in out.iterdir() if is_video(path)]
+    return max((int(match[1]) + 1 for match in taken if match), default=0)
 
 
 def cut_listed(listed: Path, out: Path, fps: float = 0.0) -> list[Path]:
