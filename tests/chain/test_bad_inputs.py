@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+import torch
 
 from pipeline.cli import main
 from pipeline.config.params import PARAMS_FILE, load_params, validate
@@ -139,6 +140,9 @@ def test_a_bad_input_gets_its_line_and_touches_nothing(
 ) -> None:
     """In a project that knows how to run everything, and has no data."""
     monkeypatch.chdir(tmp_path)
+    # Torch's libraries choose their kernels at their first use, for this process's later tests, too.
+    torch.ones(8, 8).exp() @ torch.ones(8, 8)
+    torch.conv2d(torch.ones(1, 1, 8, 8), torch.ones(1, 1, 3, 3))
     for variable in PORTABLE.items():
         monkeypatch.setenv(*variable)  # NumPy is imported already.
     for name in ("conf", "pipeline", "stages"):
