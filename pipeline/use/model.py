@@ -137,6 +137,7 @@ class Octopi:
         history: Sequence[Exchange] = (),
         max_new_tokens: int | None = None,
         memory: Path | str | None = None,
+        more: bool = False,
     ) -> str:
         """Answer a question.
 
@@ -147,13 +148,14 @@ class Octopi:
             max_new_tokens: Of the answer; by default those of the evaluation.
             memory: A folder of remembered touches: the question begins with name and classes of the object that each
                 video is most similar to.
+            more: Whether another question follows, which the published chat format writes otherwise from the first on.
 
         Raises:
             UserError: for a question that does not fit its videos or is too long, or a video that cannot be used.
         """
         if memory is not None:
             question = self.reminded(question, _listed(videos), memory)
-        return self._reply([self._prompt(question, videos, history)], max_new_tokens)[0]
+        return self._reply([self._prompt(question, videos, history, more=more)], max_new_tokens)[0]
 
     def stream(
         self,
@@ -162,9 +164,10 @@ class Octopi:
         *,
         history: Sequence[Exchange] = (),
         max_new_tokens: int | None = None,
+        more: bool = False,
     ) -> Stream:
         """As `ask`, in pieces of text as they come. Bad input is refused here, before the first piece is asked for."""
-        return Stream(self.llm, *self._prompt(question, videos, history), self._language(max_new_tokens))
+        return Stream(self.llm, *self._prompt(question, videos, history, more=more), self._language(max_new_tokens))
 
     def ask_all(
         self, asked: Sequence[tuple[str, Video | Sequence[Video]]], *, max_new_tokens: int | None = None
@@ -348,9 +351,11 @@ class Octopi:
             raise UserError(f"{counted(len(videos), 'video')}: a situation chooses between two")
         aspects = " and ".join(p.spoken for p in self.catalogue.properties)
         history: list[Exchange] = []
-        for number, turn in enumerate(psr.asked(question, aspects)[self.config.opd]):
+        turns = psr.asked(question, aspects)[self.config.opd]
+        for number, turn in enumerate(turns):
             shown = () if number else tuple(videos)
-            history.append(Exchange(turn, shown, self.ask(turn, shown, history=history)))
+            said = self.ask(turn, shown, history=history, more=len(turns) > 1)
+            history.append(Exchange(turn, shown, said))
         letter = psr.read(history[-1].answer)
         place = None if letter is None else LETTERS.index(letter)
         return Choice(question=question, answer=history[-1].answer, choice=place, notes=self.notes(videos))
@@ -372,15 +377,18 @@ class Octopi:
         history: Sequence[Exchange] = (),
         *,
         untouched: bool = False,
+        more: bool = False,
     ) -> tuple[tuple[int, ...], torch.Tensor]:
         """Token ids of a conversation whose last answer is to be said, and its frames' embeddings.
 
         Args:
             untouched: Lets a video pass in which nothing is touched.
+            more: As `ask` has it.
         """
         conversation = (*history, Exchange(question, _listed(videos), ""))
         turns = [Turn(user=with_marks(e.question, len(e.videos)), assistant=e.answer) for e in conversation]
-        prompt = write_prompt(turns, self.llm.tokenizer, self.config.language, self.config.frames.per_video)
+        per_video, single = self.config.frames.per_video, len(turns) == 1 and not more
+        prompt = write_prompt(turns, self.llm.tokenizer, self.config.language, per_video, single=single)
         positions = self.llm.positions
         if positions is not None and len(prompt) >= positions:
             raise UserError(

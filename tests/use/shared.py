@@ -161,11 +161,13 @@ def replay(
     for prediction in predictions:
         question, history = asked[prediction.question_id], []
         videos = iter(question.videos)
-        for turn, stored in zip(question.dialogue(opd).turns, prediction.outputs, strict=True):
+        turns = question.dialogue(opd).turns
+        for turn, stored in zip(turns, prediction.outputs, strict=True):
+            known = {"history": history, "more": len(turns) > 1}
             shown = tuple(files[next(videos)] for _ in range(turn.user.count("{tactile}")))
-            answer = model.ask(turn.user, shown, history=history)
+            answer = model.ask(turn.user, shown, **known)
             assert answer == stored, question.question_id
-            assert "".join(model.stream(turn.user, shown, history=history)) == stored
+            assert "".join(model.stream(turn.user, shown, **known)) == stored
             history.append(Exchange(turn.user, shown, answer))
             said.add(answer)
     assert len(said) >= 5, "answers hang on what is asked and touched"

@@ -41,11 +41,7 @@ def test_its_answers_equal_the_stored_predictions(made: Made, octopi: Octopi) ->
     ("variant", "overrides"),
     [
         (Variant(Encoder.FINETUNED, Lora.WITHOUT, Opd.NONE, 0), (*TUNED, "encoder.backbone=[timm,scenes]")),
-        # In the published format the chain knows that a second turn follows, and `ask` does not.
-        (
-            Variant(Encoder.BASE, Lora.WITH, Opd.ALL, 0),
-            ("encoder.recipe=release", "language.chat=template", "frames.selection=contact"),
-        ),
+        (Variant(Encoder.BASE, Lora.WITH, Opd.ALL, 0), ("encoder.recipe=release", "frames.selection=contact")),
         (Variant(Encoder.BASE, Lora.WITH, Opd.NEEDED, 0), (*TUNED, "encoder.backbone=[clip,scenes]")),
     ],
     ids=["tuned", "release", "base of two backbones"],
