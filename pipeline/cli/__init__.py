@@ -469,7 +469,8 @@ def match(
     found = _load(model, base, device).match(videos, named_objects(names))
     for video, name in zip(videos, found.heads, strict=True):
         typer.echo(f"{video}: {name} (by the property heads)")
-    typer.echo(found.answer)
+    if found.answer:
+        typer.echo(found.answer)
     _print_notes(found.notes)
 
 
@@ -503,19 +504,25 @@ def recognise(
 
 @app.command()
 def adapt(
-    videos: Annotated[list[Path], typer.Argument(help="Videos of another sensor, or folders of them; no labels.")],
+    videos: Annotated[list[Path], typer.Argument(help="Videos of another sensor, or folders of them.")],
     out: Annotated[Path, typer.Option(help="Folder of the copy, which --model names.")],
+    catalogue: Annotated[
+        Path | None, typer.Option(help="Ratings of the videos' objects (docs/data.md): heads are read anew from them.")
+    ] = None,
     model: Model = None,
     base: Base = None,
     device: Device = "auto",
 ) -> None:
-    """Copy a model for another sensor, whose videos say by how much it shifts and scales what the model reads."""
+    """Fit a model to another sensor by videos alone, or to your own objects and properties by a few ratings."""
     from pipeline.use.adapt import adapt as fit
+    from pipeline.use.adapt import rated_videos
     from pipeline.use.ask import videos_of
+    from pipeline.videos.catalogue import load_catalogue
 
-    found = videos_of(videos)
-    fit(_load(model, base, device), [file for file, _ in found], out)
-    typer.echo(f"{out}: fitted to {counted(len(found), 'video')}; name it with --model {out}")
+    ratings = None if catalogue is None else load_catalogue(catalogue)
+    found = {file: "" for file, _ in videos_of(videos)} if ratings is None else rated_videos(videos, ratings)
+    told = fit(_load(model, base, device), [*found], out, catalogue=ratings, objects=[*filter(None, found.values())])
+    typer.echo(f"{told}\n{out}: made of {counted(len(found), 'video')}; name it with --model {out}")
 
 
 @app.command()

@@ -1,54 +1,260 @@
-"""A trained model's copy for another sensor, by that sensor's unlabelled videos."""
+"""A trained model's copy for another sensor or other objects: by videos alone, or by rated ones."""
 
 from __future__ import annotations
 
+import logging
+import math
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 
-from pipeline.core.io import atomic_folder, sha256, write_json, write_text
-from pipeline.running.errors import UserError
+from pipeline.core.io import atomic_folder, load_tensors, save_tensors, sha256, write_json, write_text
+from pipeline.core.records import Encoder, Part
+from pipeline.encoder.few_ratings import Known, Rated, Reading, on_features, read_anew, standardised
+from pipeline.encoder.frame_classifier import FittedHeads, JointFrameClassifier
+from pipeline.encoder.records import Classification
+from pipeline.evaluation.calibration import fit_temperature
+from pipeline.evaluation.intervals import accuracy_interval
+from pipeline.running.errors import UserError, counted
+from pipeline.running.progress import track
 from pipeline.training.card import CARD_FILE
-from pipeline.training.embeddings import STATISTICS_FILE
-from pipeline.use.folder import CONFIG, ENCODER_DIR
+from pipeline.training.embeddings import STATISTICS_FILE, Statistics
+from pipeline.use.encoding import EncodedVideo
+from pipeline.use.folder import CATALOGUE, CONFIG, ENCODER_DIR, TRAINED, distance
 from pipeline.use.model import Octopi
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.files import list_videos, raise_errors
+
+log = logging.getLogger(__name__)
 
 CARD = """# {name}, fitted to another sensor
 
-A copy of `{name}`. Its embeddings are standardised by the mean and deviation of {count} frames of another sensor's
-videos, without any label. Weights and property heads are the original's, whose card has their licences and what they
-were trained on. This copy was tested on nothing.
+A copy of `{name}`, whose card has the licences of its weights and what they were trained on; these are unchanged.
+
+{told}
 """
 
 
-def adapt(model: Octopi, videos: Sequence[Path], to: Path) -> None:
-    """Copy a model's folder for the sensor of these videos: their frames' mean and deviation standardise embeddings.
+class Adapted(NamedTuple):
+    """What was changed."""
 
-    No label is needed: another sensor shifts and scales embeddings, and these say by how much. The property heads look
-    at the pictures themselves, and stay as they are.
+    changed: dict[str, torch.Tensor]
+    """Tensors of the property heads, in place of the old ones; empty where they stay."""
+    statistics: Statistics
+    features: torch.Tensor
+    """Frames as the language model is given them."""
+    told: str
+    """What a reader should know of it."""
+    temperatures: dict[str, float]
+
+
+def rated_videos(folders: Sequence[Path], catalogue: Catalogue) -> dict[Path, str]:
+    """The videos of folders by the object that each is of; those of unrated objects are left out with a warning."""
+    found: dict[Path, str] = {}
+    for folder in folders:
+        if folder.is_file():
+            raise UserError(
+                f"{folder}: is a file; name the folder of videos that the catalogue's objects are rated for"
+            )
+        listing = list_videos(folder, catalogue)
+        raise_errors(folder, listing.findings)
+        for finding in listing.findings:
+            log.warning("%s: %s", finding.item, finding.measured)
+        found |= {file.path: file.object_id for file in listing.files}
+    return found
+
+
+def adapt(
+    model: Octopi,
+    videos: Sequence[Path],
+    to: Path,
+    *,
+    catalogue: Catalogue | None = None,
+    objects: Sequence[str] = (),
+    seed: int = 0,
+) -> str:
+    """Copy a model's folder for the sensor of these videos, and say what the copy knows.
+
+    Embeddings and the logits of the property heads are standardised by the videos' frames, as another sensor shifts and
+    scales them. With ratings the heads are read anew on the frozen encoder (`pipeline.encoder.few_ratings`). A language
+    model that reads logits is given the new ones on the scale that it learnt; it is not trained.
+
+    Args:
+        catalogue: Ratings of any properties. Where they are not the model's, heads alone answer.
+        objects: With a catalogue, the object of each video.
+        seed: Of the folds that the copy is tested by.
 
     Raises:
-        UserError: for a model that does not standardise, too few or unusable videos, or where `to` is there already.
+        UserError: for a model with nothing to adapt, too few or unusable videos, or where `to` is there already.
     """
-    if not model.config.encoder.standardize:
-        raise UserError("encoder.standardize was off in training, so there is nothing to adapt; train the model anew")
+    config = model.config
     if to.exists():
         raise UserError(f"{to}: is there already; name a folder that is not")
-    features = torch.cat([model.touched(video).features for video in videos]).double()
-    if len(features) < 2:
+    classifier = model.encoder.classifier
+    heads = isinstance(classifier, JointFrameClassifier) and config.encoder_used is Encoder.FINETUNED
+    if catalogue is not None and not heads:
+        raise UserError(
+            f"{model.folder}: heads are read anew where it has been fine-tuned with encoder.recipe=tuned; leave "
+            "--catalogue out, or train such a model"
+        )
+    if not heads and not config.encoder.standardize:
+        raise UserError("encoder.standardize was off in training, so there is nothing to adapt; train the model anew")
+    encoded = [model.encoder.encode(video) for video in track(videos, "adapt", "video")]
+    for video in encoded:
+        if not video.touched:
+            log.warning("%s: left out, %s", video.name, video.touch.notes[0])
+    if catalogue is not None:
+        objects = [name for name, video in zip(objects, encoded, strict=True) if video.touched]
+        if len({*objects}) < 2:
+            raise UserError(
+                f"{counted(len({*objects}), 'rated object')} with touches; heads need two, a dozen is better"
+            )
+    encoded = [video for video in encoded if video.touched]
+    if sum(len(video.raw) for video in encoded) < 2:
         raise UserError("one frame has no deviation; name more videos")
-    std, mean = torch.std_mean(features, dim=0, correction=0)
-    known = model.encoder.statistics
-    # A dimension that is constant in these frames gives no estimate of its scale, so the old scale stays.
-    scale = known.scale * torch.where(std > 0, std, 1.0)
-    with atomic_folder(to) as made:
-        shutil.copytree(model.folder, made, dirs_exist_ok=True)
-        statistics = made / ENCODER_DIR / STATISTICS_FILE
+    made = _without_ratings(model, encoded) if catalogue is None else _rated(model, encoded, catalogue, objects, seed)
+    update: dict[str, Any] = {"scores": {}, "temperatures": made.temperatures or config.temperatures}
+    lengths = [len(video.raw) for video in encoded]
+    # Rounded up to the digits that config.json keeps, so that the farthest video itself is not flagged.
+    farthest = max(distance(part.double().numpy()) for part in made.features.split(lengths))
+    update["usual"] = math.ceil(1e4 * farthest) / 1e4
+    if catalogue is not None:
+        same = [*catalogue.classes.items()] == [*model.catalogue.classes.items()]
+        update |= {"speaks": config.speaks and same, "objects": tuple(sorted({*config.objects, *objects}))}
+    with atomic_folder(to) as folder:
+        shutil.copytree(model.folder, folder, dirs_exist_ok=True)
+        made.statistics.save(folder / ENCODER_DIR / STATISTICS_FILE)
+        if made.changed:
+            kept = {n: t for n, t in load_tensors(folder / ENCODER_DIR / TRAINED).items() if not n.startswith("heads.")}
+            save_tensors(folder / ENCODER_DIR / TRAINED, kept | made.changed)
+        if catalogue is not None:
+            write_json(folder / CATALOGUE, catalogue.model_dump(mode="json"))
+        write_text(folder / CARD_FILE, CARD.format(name=model.name, told=made.told))
+        changed = (f"{ENCODER_DIR}/{STATISTICS_FILE}", f"{ENCODER_DIR}/{TRAINED}", CATALOGUE, CARD_FILE)
+        update["files"] = {**config.files, **{name: sha256(folder / name) for name in changed}}
+        write_json(folder / CONFIG, config.model_copy(update=update).model_dump(mode="json"))
+    return made.told
+
+
+def _without_ratings(model: Octopi, encoded: Sequence[EncodedVideo]) -> Adapted:
+    """Standardise what the language model reads, and the heads' logits, by these videos."""
+    known, classifier = model.encoder.statistics, model.encoder.classifier
+    features, changed = torch.cat([video.features for video in encoded]).double(), {}
+    told = f"Its embeddings are standardised by {counted(len(encoded), 'video')}, without a label."
+    statistics = known
+    if model.config.encoder.standardize:
+        std, mean = torch.std_mean(features, dim=0, correction=0)
+        # A dimension that is constant in these frames gives no estimate of its scale, so the old scale stays.
+        scale = known.scale * torch.where(std > 0, std, 1.0)
         # The features are standardised already, so the new mean and deviation come on top of the old ones.
-        known._replace(mean=known.mean + mean * known.scale, scale=scale).save(statistics)
-        write_text(made / CARD_FILE, CARD.format(name=model.name, count=len(features)))
-        own = {f.relative_to(made).as_posix(): sha256(f) for f in (statistics, made / CARD_FILE)}
-        config = model.config.model_copy(update={"files": {**model.config.files, **own}, "scores": {}})
-        write_json(made / CONFIG, config.model_dump(mode="json"))
+        statistics = known._replace(mean=known.mean + mean * known.scale, scale=scale)
+        features = (features - mean) / torch.where(std > 0, std, 1.0)
+    if isinstance(classifier, JointFrameClassifier) and model.config.encoder_used is Encoder.FINETUNED:
+        clips, linear = _clips(encoded), _linear(model)
+        # Which classes occur together among the objects of its training says nothing of other objects.
+        found = on_features(standardised(linear, clips), clips, classifier.classes, np.zeros(classifier.classes))
+        changed = _tensors(found)
+        told += " So are the logits of its property heads. It was tested on nothing."
+    return Adapted(changed, statistics, features, told, {})
+
+
+def _rated(
+    model: Octopi, encoded: Sequence[EncodedVideo], catalogue: Catalogue, objects: Sequence[str], seed: int
+) -> Adapted:
+    """Read the heads anew, and test them on objects that were held out."""
+    levels = [len(p.levels) for p in catalogue.properties]
+    same = [*catalogue.classes.items()] == [*model.catalogue.classes.items()]
+    clips, labels = _clips(encoded), np.array([catalogue.labels(o) for o in objects])
+    read = read_anew(Rated(clips, labels, np.array(objects)), levels, Known(_linear(model), same), seed)
+    statistics = model.encoder.statistics
+    if statistics.heads is not None:
+        logits = torch.from_numpy(read.logits)
+        # Of objects that the heads did not see, as all later ones are: of their own they are too sure.
+        std, mean = torch.std_mean(logits, dim=0, correction=0)
+        weights, biases = map(torch.from_numpy, read.heads.linear())
+        scale = torch.where(std > 0, std, 1.0)
+        statistics = statistics._replace(mean=mean, scale=scale, heads=(weights, biases))
+        features = (torch.from_numpy(clips).flatten(0, 1).double() @ weights.T + biases - mean) / scale
+    else:
+        plain = _without_ratings(model, encoded)
+        statistics, features = plain.statistics, plain.features
+    temperatures = {
+        p.name: fit_temperature(
+            [
+                Classification(
+                    video_id=video.name,
+                    object_id=own,
+                    part=Part.VALIDATION,
+                    property=p.name,
+                    expected=expected,
+                    predicted=int(table.argmax()),
+                    probabilities=tuple(np.exp(table).tolist()),
+                )
+                for video, own, expected, table in zip(
+                    encoded, objects, labels[:, place].tolist(), read.evidence[place], strict=True
+                )
+            ]
+        )
+        for place, p in enumerate(catalogue.properties)
+    }
+    told = _expected(read, labels, objects, catalogue.classes)
+    if not same:
+        told += "\nIts language model knows other properties, and is not asked; heads alone answer."
+    return Adapted(_tensors(read.heads), statistics, features, told, temperatures)
+
+
+def _expected(read: Reading, labels: np.ndarray, objects: Sequence[str], classes: dict[str, tuple[str, ...]]) -> str:
+    """What is to be expected of new objects, by those that were held out."""
+
+    def right(found: np.ndarray) -> np.ndarray:
+        whole: np.ndarray = (found == labels).all(axis=1).astype(np.float64)
+        return whole
+
+    whole = right(read.predicted)
+    each = ", ".join(
+        f"{name} {100 * s:.0f}" for name, s in zip(classes, (read.predicted == labels).mean(0), strict=True)
+    )
+    interval = accuracy_interval(whole, [(name,) for name in objects])
+    ends = "" if interval is None else f" [{100 * interval.low:.0f}, {100 * interval.high:.0f}]"
+    number, share, half = len({*objects}), 100 * whole.mean(), 100 * right(read.halved).mean()
+    chance, usual = 100 / math.prod(map(len, classes.values())), 100 * right(read.usual).mean()
+    rest = f"chance {chance:.1f}, the most frequent classes {usual:.1f}"
+    more = (
+        f"twice as many objects may bring some {share - half:.0f} points more"
+        if share > half
+        else "what more objects would bring cannot be said"
+    )
+    return (
+        f"Its property heads are read from {read.way}, by {counted(number, 'rated object')} "
+        f"({counted(len(labels), 'video')}).\n"
+        f"Expected of new objects (each held out once): all properties right in {share:.1f} %{ends} of videos\n"
+        f"({each}); {rest}.\nHalf as many objects gave {half:.1f} %, so {more}."
+    )
+
+
+def _clips(encoded: Sequence[EncodedVideo]) -> np.ndarray:
+    """Features of the encoder, videos x frames x dim."""
+    return np.stack([video.raw.numpy() for video in encoded])
+
+
+def _linear(model: Octopi) -> tuple[np.ndarray, np.ndarray]:
+    """The logits' linear map: that which the language model reads, or that of the property heads."""
+    if model.encoder.statistics.heads is not None:
+        weights, biases = model.encoder.statistics.heads
+        return weights.numpy(), biases.numpy()
+    state = {name: t.detach().cpu().double().numpy() for name, t in model.encoder.classifier.state_dict().items()}
+    count = len(model.catalogue.properties)
+    weights = np.concatenate([state[f"heads.{n}.weight"] for n in range(count)]) / state["spread"]
+    return weights, np.concatenate([state[f"heads.{n}.bias"] for n in range(count)]) - weights @ state["centre"]
+
+
+def _tensors(found: FittedHeads) -> dict[str, torch.Tensor]:
+    """Heads as a model's file has them."""
+    named: dict[str, np.ndarray] = {"centre": found.centre, "spread": found.spread, "dependence": found.dependence}
+    for number, (weight, bias) in enumerate(zip(found.weights, found.biases, strict=True)):
+        named |= {f"heads.{number}.weight": weight, f"heads.{number}.bias": bias}
+    return {name: torch.from_numpy(np.ascontiguousarray(array)).float() for name, array in named.items()}

@@ -41,8 +41,8 @@ class EncodedVideo(NamedTuple):
     """Whether anything touches the sensor."""
     features: torch.Tensor
     """float32, frames x dim."""
-    embedding: torch.Tensor
-    """float32, dim: the mean over its frames, before property heads and as the encoder has it."""
+    raw: torch.Tensor
+    """float32, frames x dim: as the encoder has them, neither standardised nor read by heads."""
 
 
 class Classified(NamedTuple):
@@ -81,7 +81,7 @@ class VideoEncoder:
                 unlike = f"{far:.1f} deviations from its mean, where its own videos reach {usual:.1f}"
                 touch = touch.model_copy(update={"notes": (*touch.notes, f"unlike training: {unlike}")})
             features = standard if config.encoder.standardize else raw
-            self._encoded[key] = EncodedVideo(name, touch, touch.strength > config.quiet, features, raw.mean(0))
+            self._encoded[key] = EncodedVideo(name, touch, touch.strength > config.quiet, features, raw)
         self._encoded.move_to_end(key)
         touches = [encoded.touch for encoded in self._encoded.values()]
         sizes = [t.frames.nbytes + t.reference.nbytes + t.difference.nbytes for t in touches]
@@ -94,13 +94,13 @@ class VideoEncoder:
     def classify(self, video: Video) -> Classified:
         """What the property heads say of a video."""
         frames, numbers = self._pictures(self.encode(video).touch)
-        logits = self._classifier(frames[None], numbers[None])["logits"].cpu()
+        logits = self.classifier(frames[None], numbers[None])["logits"].cpu()
         parts = logits.double().split([len(p.levels) for p in self.catalogue.properties], dim=1)
         probabilities = tuple(
             tuple(rescale(part.softmax(1)[0].numpy(), self.config.temperatures[p.name]).tolist())
             for part, p in zip(parts, self.catalogue.properties, strict=True)
         )
-        return Classified(probabilities, tuple(self._classifier.decide(logits)[0].tolist()))
+        return Classified(probabilities, tuple(self.classifier.decide(logits)[0].tolist()))
 
     def _pictures(self, touch: Touch) -> tuple[torch.Tensor, torch.Tensor]:
         """What the encoder takes: frames, or their differences to the reference, and their places in the video."""
@@ -114,7 +114,8 @@ class VideoEncoder:
         return self.config.encoder.model_copy(update=files)
 
     @cached_property
-    def _classifier(self) -> PropertyClassifier:
+    def classifier(self) -> PropertyClassifier:
+        """The fine-tuned encoder with its property heads."""
         classifier = property_classifier(self._own, [len(p.levels) for p in self.catalogue.properties])
         if not self.config.heads:
             classifier.heads.requires_grad_(False)  # So that the file need not have them.
@@ -124,7 +125,7 @@ class VideoEncoder:
     @cached_property
     def _encoder(self) -> FrameEncoder:
         if self.config.encoder_used is Encoder.FINETUNED:
-            return self._classifier.encoder
+            return self.classifier.encoder
         return base_encoder(self._own).to(self.device).eval()
 
 

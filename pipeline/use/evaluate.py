@@ -50,7 +50,8 @@ def answers_about(
     catalogue = load_catalogue(Path(params.data.catalogue)).asking(params.questions.scenarios)
     catalogue = catalogue.called("number" if octopi.numbered else "catalogue")
     known, wanted = (
-        "; ".join(f"{p.name}: {', '.join(p.levels)}" for p in c.properties) for c in (octopi.catalogue, catalogue)
+        "; ".join(f"{name}: {', '.join(levels)}" for name, levels in c.classes.items())
+        for c in (octopi.catalogue, catalogue)
     )
     if known != wanted:
         logger.warning("%s is not asked: it knows %s, but %s has %s", octopi.name, known, params.data.catalogue, wanted)

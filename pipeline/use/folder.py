@@ -71,6 +71,9 @@ class ModelConfig(Record):
     """Whose embeddings the language model reads; the heads are always those of the fine-tuned encoder."""
     heads: bool = True
     """Whether it has property heads; without them, classes are read off the model's own sentence."""
+    speaks: bool = True
+    """Whether its language model knows the catalogue's properties; a copy whose heads were read anew for others does
+    not, and heads alone answer."""
     opd: Opd
     """How much it was trained to describe before it concludes."""
     trained_on: str
@@ -107,7 +110,11 @@ class ModelConfig(Record):
         """A hash of all that answers depend on, by which two trainings of one variant are told apart."""
         # Folders that were made before a setting was there keep their hash.
         told = self.model_copy(update={"scores": {}, "versions": {}}).model_dump(mode="json", exclude={"objects"})
-        for section, setting, usual in ((told, "heads", True), (told["language"], "chat", "template")):
+        for section, setting, usual in (
+            (told, "heads", True),
+            (told, "speaks", True),
+            (told["language"], "chat", "template"),
+        ):
             if section[setting] == usual:
                 del section[setting]
         return fingerprint(json.dumps(told, sort_keys=True))

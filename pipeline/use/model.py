@@ -37,6 +37,7 @@ from pipeline.weights.backbones import reads_weights
 NUMBERED = re.compile(r"object \d+")
 ALONE = "the question compares, but there is one video: what it says of another is made up"
 APART = "the sentence and the property heads disagree; heads alone are right more often (the card has both)"
+MUTE = "its language model knows other properties and is not asked; property heads alone answer"
 RANDOM = "its base models are tiny and random, made to test the chain: no answer of it means anything"
 
 logger = logging.getLogger(__name__)
@@ -208,10 +209,14 @@ class Octopi:
     def describe_all(self, videos: Sequence[Video], *, sentence: bool = True) -> list[Description]:
         """As `describe`, of many videos in one batch. A video without contact is described with a note."""
         described, asked = [], []
-        heads, tells = self.config.heads, self.config.opd is not Opd.NONE
-        doubts: tuple[str, ...] = (
-            () if tells else ("this variant was not trained to describe, so there is no sentence",)
-        )
+        heads, tells = self.config.heads, self.config.opd is not Opd.NONE and self.config.speaks
+        doubts: tuple[str, ...] = ()
+        if not tells:
+            doubts = (
+                ("this variant was not trained to describe, so there is no sentence",)
+                if self.config.speaks
+                else (MUTE,)
+            )
         doubts += () if heads else ("it has no property heads; its classes are those that its sentence names",)
         for video in videos:  # All of a video at once, as not all may be remembered.
             encoded, classified = self.encoder.encode(video), self.encoder.classify(video) if heads else Classified()
@@ -258,7 +263,9 @@ class Octopi:
             notes += [f"{encoded.name}: {note}" for note in encoded.touch.notes]
             expected.append(self._classes(video)[place][1])
         answer, most = "", None
-        if len(videos) == 3:
+        if not self.config.speaks:
+            notes.append(MUTE)
+        elif len(videos) == 3:
             answer = self.ask(pss.asked(pss.TEMPLATES[0], known.most, known.spoken)[self.config.opd], videos)
             letter = pss.read(answer)
             most = None if letter is None else LETTERS.index(letter)
@@ -304,13 +311,14 @@ class Octopi:
         if self.config.facts or told:
             facts = pom.facts(catalogue, list(found), random.Random(derive_seed("facts", *listed)))
             question = f"{facts} {question}"
-        answer = self.ask(question, videos)
+        answer = self.ask(question, videos) if self.config.speaks else ""
         read = pom.read(answer, listed)
         said = None if read is None else tuple(called[listed[read[letter]]] for letter in LETTERS[: len(listed)])
         nearest = pom.nearest([self._classes(video) for video in videos], catalogue)
         heads = tuple(called[found[i].name] for i in nearest)
         answer = NUMBERED.sub(lambda name: called.get(name[0], name[0]), answer)
         untrained = () if len(listed) == 3 else ("it was trained to match three videos, not two",)
+        untrained = untrained if self.config.speaks else (MUTE,)
         apart = (APART,) if said not in (None, heads) else ()
         notes = (*untrained, *apart, *self.notes(videos))
         return Matching(question=question, answer=answer, names=said, heads=heads, notes=notes)
@@ -324,7 +332,7 @@ class Octopi:
         encoded = self.touched(video)
         levels = [level for level, _ in self._classes(video)]
         classes = tuple(p.levels[level] for p, level in zip(self.catalogue.properties, levels, strict=True))
-        embedding = tuple(encoded.embedding.tolist())
+        embedding = tuple(encoded.raw.mean(0).tolist())
         touch = Remembered(name=name, classes=classes, encoder=self._encoder_name, embedding=embedding)
         return remember(Path(memory), touch)
 
@@ -335,7 +343,7 @@ class Octopi:
         """
         encoded = self.touched(video)
         touches = recall(Path(memory), self._encoder_name)
-        objects = most_similar(encoded.embedding.double().numpy(), touches)
+        objects = most_similar(encoded.raw.mean(0).double().numpy(), touches)
         return Recognition(objects=objects, touches=len(touches), notes=self.notes(video))
 
     def reminded(self, question: str, videos: Sequence[Video], memory: Path | str) -> str:
@@ -385,6 +393,8 @@ class Octopi:
             untouched: Lets a video pass in which nothing is touched.
             more: As `ask` has it.
         """
+        if not self.config.speaks:
+            raise UserError(f"{self.folder}: {MUTE}; use describe, rank or match")
         conversation = (*history, Exchange(question, _listed(videos), ""))
         turns = [Turn(user=with_marks(e.question, len(e.videos)), assistant=e.answer) for e in conversation]
         per_video, single = self.config.frames.per_video, len(turns) == 1 and not more

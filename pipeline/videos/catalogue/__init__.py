@@ -73,6 +73,11 @@ class Catalogue(Record):
         return tuple(p.name for p in self.properties)
 
     @property
+    def classes(self) -> dict[str, tuple[str, ...]]:
+        """The classes of each property: what two catalogues must have in common for one's heads to fit the other."""
+        return {p.name: p.levels for p in self.properties}
+
+    @property
     def split_names(self) -> tuple[str, ...]:
         """The splits that objects.csv has columns for, in the columns' order."""
         return tuple(next(iter(self.objects.values())).splits)

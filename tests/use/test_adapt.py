@@ -1,0 +1,139 @@
+"""A model's copy for another sensor, by videos alone and by rated ones: against float64 of what its heads see."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.special import log_softmax, logsumexp
+
+from pipeline.core.io import read_json
+from pipeline.encoder.few_ratings import Known, Rated, Way, fit, read_anew, standardised
+from pipeline.use.adapt import adapt, rated_videos
+from pipeline.use.folder import CONFIG, read_folder
+from pipeline.use.model import Octopi
+from pipeline.videos.catalogue import Catalogue, load_catalogue
+from tests.checkpoints import edit
+from tests.closure import ROOT
+from tests.conftest import refused
+from tests.models import model_folder
+
+EXAMPLES = ROOT / "examples"
+VIDEOS = [EXAMPLES / f"{name}.mp4" for name in ("soft", "hard", "rough")]
+CLASSES = [3, 2]
+
+
+def planted(objects: int, seed: int = 0) -> tuple[Rated, Known]:
+    """Two videos an object of three frames; the old heads' logits tell the classes, on another sensor's scale."""
+    rng = np.random.default_rng(seed)
+    labels = np.repeat(np.stack([np.arange(objects) % 3, np.arange(objects) // 3 % 2], axis=1), 2, axis=0)
+    told = np.concatenate([np.eye(3)[labels[:, 0]], np.eye(2)[labels[:, 1]]], axis=1)
+    clips = np.concatenate([7 + 20 * told, np.zeros((len(told), 40))], axis=1)[:, None]
+    clips = (clips + rng.normal(size=(len(told), 3, 45))).astype(np.float32)
+    linear = np.eye(5, 45), np.zeros(5)
+    return Rated(clips, labels, np.repeat([f"o{n:02}" for n in range(objects)], 2)), Known(linear, alike=True)
+
+
+@pytest.mark.parametrize(("objects", "alike"), [(4, True), (12, True), (12, False)])
+def test_new_heads_find_classes_that_others_heads_tell(objects: int, alike: bool) -> None:
+    rated, known = planted(objects)
+    read = read_anew(rated, CLASSES, known._replace(alike=alike), 0)
+    np.testing.assert_array_equal(read.heads.predict(rated.clips), rated.labels)
+    if objects == 12:
+        assert (read.predicted == rated.labels).mean() > 0.9
+    weights, biases = read.heads.linear()
+    assert weights.shape == (5, 45)
+    assert biases.shape == (5,)
+
+
+def test_an_object_is_tested_by_heads_that_never_saw_it() -> None:
+    """Labels that nothing tells: heads know those of their own objects, and guess those that are held out."""
+    rated, known = planted(20)
+    rng = np.random.default_rng(1)
+    noise = rng.normal(size=(20, 1, 300)).repeat(2, axis=0).repeat(3, axis=1).astype(np.float32)
+    labels = rng.integers(0, 2, (20, 2)).repeat(2, axis=0)
+    blind = Rated(noise + 0.01 * rng.normal(size=noise.shape).astype(np.float32), labels, rated.objects)
+    read = read_anew(blind, CLASSES, Known((np.eye(5, 300), np.zeros(5)), alike=False), 0)
+    own = fit(blind, CLASSES, known, Way.FEATURES).predict(blind.clips)
+    assert (own == labels).mean() > 0.9
+    assert (read.predicted == labels).mean() < 0.75
+
+
+def test_a_constant_logit_tells_nothing_and_breaks_nothing() -> None:
+    rated, known = planted(6)
+    linear = known.linear[0].copy()
+    linear[2] = 0
+    weights, biases = standardised((linear, known.linear[1]), rated.clips)
+    logits = rated.clips.reshape(-1, 45) @ weights.T + biases
+    np.testing.assert_allclose(logits.mean(axis=0), 0, atol=1e-6)
+    np.testing.assert_allclose(logits.std(axis=0), [1, 1, 0, 1, 1], atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def octopi() -> Octopi:
+    return Octopi.from_pretrained(base=model_folder("smollm2"), dtype="float32")
+
+
+@pytest.mark.slow
+def test_without_ratings_embeddings_and_heads_are_standardised(octopi: Octopi, tmp_path: Path) -> None:
+    adapt(octopi, VIDEOS, tmp_path / "mine")
+    mine = Octopi.from_pretrained(tmp_path / "mine", base=model_folder("smollm2"), dtype="float32")
+    before, after = (torch.cat([m.encoder.encode(v).features for v in VIDEOS]).double() for m in (octopi, mine))
+    expected = (before - before.mean(0)) / before.std(0, correction=0)
+    torch.testing.assert_close(after, expected, rtol=1e-4, atol=1e-4)
+    for place, video in enumerate(VIDEOS):
+        logits = expected.view(3, -1, 9)[place].split(3, dim=1)
+        found, temperatures = mine.encoder.classify(video).probabilities, mine.config.temperatures.values()
+        for probabilities, own, temperature in zip(found, logits, temperatures, strict=True):
+            pooled = logsumexp(log_softmax(own.numpy(), axis=1), axis=0) / temperature
+            np.testing.assert_allclose(probabilities, np.exp(log_softmax(pooled)), atol=2e-3)
+    assert not mine.config.scores, "they were another's"
+    assert mine.ask("Is it soft?", VIDEOS[0])
+    with refused("is there already"):
+        adapt(octopi, VIDEOS, tmp_path / "mine")
+    told = tmp_path / "mine" / CONFIG
+    edit(told, language={**read_json(told)["language"], "touch_noise": 0.0})
+    assert read_folder(tmp_path / "mine")[0] == mine.config, "as models of before say it"
+    edit(told, language="none")
+    with refused("config.json: language"):
+        read_folder(tmp_path / "mine")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("other", [False, True], ids=["its own properties", "others"])
+def test_with_ratings_heads_know_them(octopi: Octopi, catalogue: Catalogue, tmp_path: Path, other: bool) -> None:
+    """The language model reads logits whose mean is 0 over objects that heads did not see, or is not asked."""
+    ratings = load_catalogue(EXAMPLES / "new_sensor") if other else catalogue
+    names = ["foam", "brick", "sandpaper"] if other else ["sponge_soft", "wood_ruler", "rug"]
+    (tmp_path / "videos").mkdir()
+    for name, video in zip(names, VIDEOS, strict=True):
+        for number in range(2):
+            shutil.copy(video, tmp_path / "videos" / f"{name}_{number}.mp4")
+    shutil.copy(VIDEOS[0], tmp_path / "videos" / "unrated_0.mp4")
+    found = rated_videos([tmp_path / "videos"], ratings)
+    assert len(found) == 6
+    told = adapt(octopi, [*found], tmp_path / "mine", catalogue=ratings, objects=[*found.values()])
+    assert "3 rated objects (6 videos)" in told
+    mine = Octopi.from_pretrained(tmp_path / "mine", base=model_folder("smollm2"), dtype="float32")
+    described = mine.describe(VIDEOS[0])
+    right = [p.levels[level] for p, level in zip(ratings.properties, ratings.labels(names[0]), strict=True)]
+    assert not other or list(described.levels.values()) == right
+    assert set(described.levels) == set(ratings.property_names)
+    assert bool(described.sentence) is not other
+    assert len(mine.rank(VIDEOS, ratings.properties[0].name).order) == 3
+    assert bool(mine.match(VIDEOS, names).answer) is not other
+    if other:
+        with refused("knows other properties"):
+            mine.ask("Is it soft?", VIDEOS[0])
+
+
+@pytest.mark.slow
+def test_what_cannot_be_adapted(octopi: Octopi, catalogue: Catalogue, tmp_path: Path) -> None:
+    with refused("1 rated object with touches"):
+        adapt(octopi, VIDEOS, tmp_path / "mine", catalogue=catalogue, objects=["rug"] * 3)
+    with refused("name the folder of videos"):
+        rated_videos(VIDEOS[:1], catalogue)
+    assert not (tmp_path / "mine").exists()
