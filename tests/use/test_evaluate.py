@@ -189,7 +189,7 @@ def test_it_is_not_asked_about_properties_or_classes_of_others(
     update: dict[str, Any], catalogue: Catalogue, caplog: pytest.LogCaptureFixture
 ) -> None:
     first, *rest = catalogue.properties
-    known = SimpleNamespace(properties=(first.model_copy(update=update), *rest))
+    known = SimpleNamespace(classes={p.name: p.levels for p in (first.model_copy(update=update), *rest)})
     model = SimpleNamespace(catalogue=known, numbered=True, name="octopi-small")
     params = compose("smoke", ["evaluate.questions=4", f"data.catalogue={ROOT}/pipeline/physiclear"], ROOT / "conf")
     assert answers_about(cast(Octopi, model), params, fake_videos(["rug"]), {}) == []
