@@ -74,13 +74,11 @@ def write_page(root: Path) -> Path:
             gaps.append((place.name, "the whole report", f"its provenance.json lacks {error}; write it anew"))
     if not chapters:
         raise UserError(f"{folder}: no whole report yet; `make repro` writes one")
-    # The current report, then real videos, scenes, looked-at test objects, smoke.
-    chapters.sort(
-        key=lambda c: (not c["current"], c["scale"] == "smoke", c["looked_at"] != "", c["source"] != "videos")
-    )
+    # The current report, then real videos, scenes, smoke.
+    chapters.sort(key=lambda c: (not c["current"], c["scale"] == "smoke", c["source"] != "videos"))
     gaps += left_to_users([c["report"] for c in chapters])
     # What random models answer is chance, and nothing to hold against the paper.
-    reports = {c["name"] + ("†" if c["looked_at"] else ""): c["report"] for c in chapters if not c["plumbing"]}
+    reports = {c["name"]: c["report"] for c in chapters if not c["plumbing"]}
     stability = _measured(folder / "stability.csv", STABILITY, gaps)
     style = " ".join(render("style.css").split())
     text = render(

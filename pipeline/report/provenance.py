@@ -80,8 +80,8 @@ def provenance(
         "seeds": list(seeds),
         "folds": {"of": split.folds, "tested": folds, "trained": split.train_objects} if folds else None,
         "replicates": len({split.replicate_of(seed) for seed in seeds}),
-        # What people noted about the test objects of this report, or else of its split. Other data has other objects.
-        "settings": notes.get(f"{params.report_name}/{split.name}", notes.get(split.name, "")),
+        # What people noted about its test objects. Other data has other objects.
+        "settings": notes.get(f"{params.report_name}/{split.name}", ""),
         "intervals": coverage_note(asked),
         "facts_told": params.questions.facts,
         "beyond_paper": beyond_paper(params, root / CONF) if based else {},

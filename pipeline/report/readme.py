@@ -37,10 +37,10 @@ def sections(report: Report) -> dict[str, Any]:
     Returns:
         `name`; `trained`, whether the run has models of its own; `shipped`, how models that were trained before answer
         about its videos, and `tasks`, the full system's answers: a `Block` each, or None; `tables`, the other blocks of
-        the registry; `finding`; `plumbing`, a warning where a base model is a random one; `looked_at`, how recipes were
-        chosen by the test objects, if these are the development split's; `other_models`, where published figures stand
-        beside; `stands_on`, what a figure is worth: models with their size, test objects, seeds; `beyond`, the settings
-        that its last fact counts; `origin`: command, hash of the code, data, models by hash, packages.
+        the registry; `finding`; `plumbing`, a warning where a base model is a random one; `other_models`, where
+        published figures stand beside; `stands_on`, what a figure is worth: models with their size, test objects,
+        seeds; `beyond`, the settings that its last fact counts; `origin`: command, hash of the code, data, models by
+        hash, packages.
     """
     said, shipped = report.provenance, SHIPPED_TABLE.block(report)
     trained = bool(said["base_models"])
@@ -61,7 +61,6 @@ def sections(report: Report) -> dict[str, Any]:
         "tables": [block for table in TABLES if (block := table.block(report))],
         "finding": finding(report),
         "plumbing": PLUMBING if at_random(said) else "",
-        "looked_at": said["settings"] if said["split"] == "development" else "",
         "other_models": (OTHER_MODELS if trained else OTHER_QUESTIONS) if len(report.published) else "",
         "stands_on": render("stands_on.md", said=said, shown=SHOWN_WORDS).splitlines(),
         "beyond": render("beyond.md", said=said).strip(),

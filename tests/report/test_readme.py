@@ -76,17 +76,6 @@ def test_random_base_models_are_said_to_be_chance_first(part: str) -> None:
     assert "tiny and random" not in finding(report([score()], scale="smoke"))[0]
 
 
-def test_spoilt_test_objects_are_no_headline() -> None:
-    note = "They were looked at while recipes changed."
-    spoilt = render_readme(report([score()], split="development", settings=note), ["effects.png"])
-    head, _, rest = spoilt.partition("## On test objects that were looked at")
-    assert "| Task" not in head
-    assert "![What encoder" not in head
-    assert note in rest.split("| Task")[0]
-    kfold = render_readme(report([score()], split="kfold", settings=note), ["curves.png"])
-    assert "| Task" in kfold.split("## What the figures stand on")[0]
-
-
 @pytest.mark.parametrize(("backbone", "before"), [("[scenes]", "ablation: "), ("[clip,scenes]", "noted here, beside ")])
 def test_the_base_encoder_is_what_its_backbones_read(tmp_path: Path, backbone: str, before: str) -> None:
     """`encoder.weights` names a random CLIP, which counts only where a backbone reads it."""

@@ -132,7 +132,7 @@ def test_every_fold_is_audited(workplace: Path, catalogue: Catalogue) -> None:
 @pytest.fixture(scope="module")
 def public(real_data: Path, catalogue: Catalogue) -> list[Finding]:
     """Of the public videos, with the audit's own number of permutations: `few_permutations` begins after it."""
-    return audit_folder(real_data, catalogue, SplitConfig(name="development"))
+    return audit_folder(real_data, catalogue, PAPER)
 
 
 @pytest.mark.slow
