@@ -25,7 +25,6 @@ from pipeline.videos.records import Assignment, Video
 from pipeline.weights.backbones import BACKBONES, reads_weights
 
 PACKAGES = ("torch", "transformers", "peft", "open_clip_torch", "scipy", "scikit-learn", "dvc")
-UNKNOWN = "unknown"
 NOTES = Path(__file__).with_name("notes.yaml")
 """What only people know about a report: whether its settings were chosen on its test objects before."""
 ARCHITECTURES = {
@@ -62,9 +61,10 @@ def provenance(
     rows = "\n".join(video.model_dump_json() for video in videos)
     test = {a.video_id: a.object_id for assignments in splits for a in assignments if a.part is Part.TEST}
     seeds, split = params.ablation.seeds, params.split
-    based: tuple[str, ...] = ("encoder", "language") if reads_weights(params.encoder) else ("language",)
-    if not params.ablation.train:
-        based = ()
+    based = ["language"] if params.ablation.train else []
+    if based and reads_weights(params.encoder):
+        based.insert(0, "encoder")
+    backbones = [BACKBONES[name] for name in params.encoder.backbone]
     folds = sorted({fold for seed in seeds if (fold := split.fold_of(seed)) is not None})
     notes: dict[str, str] = yaml.safe_load(NOTES.read_text(encoding="utf-8")).get(catalogue.language.dataset, {})
     return {
@@ -94,15 +94,10 @@ def provenance(
         "encoder": encoder_words(params.encoder) if based else "",
         "base_models": {part: base_model(root, getattr(params, part).weights) for part in based},
         # In words, those of the base encoder's backbones that the chain pretrains itself.
-        "own_backbones": [BACKBONES[b].words for b in params.encoder.backbone if based and not reads(b)],
+        "own_backbones": [own.words for own in backbones if based and own.key != "weights"],
         "python": ".".join(platform.python_version_tuple()[:2]),
         "packages": {name: metadata.version(name) for name in PACKAGES},
     }
-
-
-def reads(backbone: str) -> bool:
-    """Whether a backbone reads `encoder.weights`."""
-    return BACKBONES[backbone].key == "weights"
 
 
 def evaluated(models: Sequence[str]) -> list[dict[str, str]]:
@@ -174,7 +169,7 @@ def digest(folder: Path) -> str:
     """SHA-256 over the names and hashes of a folder's files, hidden ones (downloads leave them) left out."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     shown = [file for file in files if not any(part.startswith(".") for part in file.relative_to(folder).parts)]
-    return hash_of(shown, folder) if shown else UNKNOWN
+    return hash_of(shown, folder) if shown else "unknown"
 
 
 def hash_of(files: Sequence[Path], folder: Path = ROOT) -> str:
