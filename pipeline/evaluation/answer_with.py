@@ -7,18 +7,16 @@ arXiv:2309.02561), which it asks for classes alone. Answers are written to `exte
 
 from __future__ import annotations
 
-import base64
 import hashlib
 import json
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import cv2
 from pydantic import Field
 
 from pipeline.config import Params
@@ -26,19 +24,16 @@ from pipeline.core.io import read_jsonl
 from pipeline.core.layout import EXTERNAL, questions_file
 from pipeline.core.records import Opd, Prediction, Question, Record
 from pipeline.evaluation.outside import asked, record, turns_of
+from pipeline.evaluation.pictures import Show, frames, photos
 from pipeline.evaluation.records import Shown, VisionModel
 from pipeline.running.errors import UserError
 from pipeline.running.progress import track
 from pipeline.running.stage import alone
-from pipeline.training.sampling import sample_evaluation
 from pipeline.videos.catalogue import Catalogue, load_catalogue
-from pipeline.videos.frames.store import FrameStore, frames_key
+from pipeline.videos.frames.store import frames_key
 
-PHOTO_SUFFIXES = (".jpeg", ".jpg", ".png", ".webp")
 EXAMPLES = 3
 """Most training questions that stand before a question as examples (few-shot)."""
-LONGEST = 1024
-"""Pixels of a photo's longer side that are sent at most."""
 FILTERS = ("content_filter", "content_policy_violation")
 """Codes by which an endpoint says that it will not answer this question, with status 400."""
 KINDS = {
@@ -46,10 +41,6 @@ KINDS = {
     "a soft gel films how an object presses into the gel.",
     Shown.PHOTOS: "In place of each tactile video you see photos of the object that was touched in it.",
 }
-
-
-Show = Callable[[str], list[str]]
-"""From a video's id to the pictures that stand for it, as URLs with all of their data."""
 
 
 class Reply(Record):
@@ -88,7 +79,7 @@ def ask_all(params: Params, url: str, settings: Mapping[str, Any], shown: Shown,
     with alone(f"answer-with@{name}"):
         every = [(seed, question) for seed, own in asked(params).items() for question in own]
         training = {seed: read_jsonl(questions_file(seed, "train"), Question) for seed in params.ablation.seeds}
-        show = (_frames if shown is Shown.FRAMES else _photos)(folder, [question for _, question in every], most)
+        show = (frames if shown is Shown.FRAMES else photos)(folder, [question for _, question in every], most)
         endpoint, used = _Endpoint(url, settings, place / "cache.jsonl"), dict[str, Reply]()
         answers: dict[int, list[Prediction]] = {seed: [] for seed in training}
         for seed, question in track(every, name, "question"):
@@ -204,45 +195,3 @@ class _Endpoint:
             raise UserError(f"{self.url}: {why}; what it said before is kept, run it again to go on") from None
         ended = "nothing" if ended == "stop" and not text else ended
         return Reply(request=request, ended=ended, text=text, tokens=tokens, model=completion.model or "")
-
-
-def _frames(folder: Path, questions: Sequence[Question], most: int) -> Show:
-    """Those frames of a video that every variant is given, as PNG: what was kept, bit by bit."""
-    store = FrameStore(folder)
-
-    def show(video: str) -> list[str]:
-        if not (count := len(store.rows(video))):
-            raise UserError(f"{folder}: no frame of {video}; run `dvc repro extract_frames`")
-        return [_url(frame[..., ::-1], "png") for frame in store.pictures(video, _places(count, most))]
-
-    return show
-
-
-def _photos(folder: Path, questions: Sequence[Question], most: int) -> Show:
-    """Photos of the object that was touched in a video."""
-    found: dict[str, list[Path]] = {}
-    for video, name in sorted({pair for q in questions for pair in zip(q.videos, q.objects, strict=True)}):
-        # Those named after it, and those in the folder of its name.
-        files = [*folder.glob(f"{name}.*"), *(folder / name).glob("[!.]*")]
-        found[video] = sorted(f for f in files if f.suffix.lower() in PHOTO_SUFFIXES)
-        if not found[video]:
-            kinds = ", ".join(PHOTO_SUFFIXES)
-            raise UserError(f"{folder}: no photo of {name}; put {name}.jpg or a folder {name}/ there ({kinds})")
-
-    def read(file: Path) -> str:
-        if (photo := cv2.imread(str(file))) is None:  # Upright, as its camera was held.
-            raise UserError(f"{file}: not a picture that can be read; replace it")
-        scale = min(1.0, LONGEST / max(photo.shape[:2]))
-        return _url(cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), "jpeg")
-
-    return lambda video: [read(found[video][i]) for i in _places(len(found[video]), most)]
-
-
-def _places(count: int, most: int) -> list[int]:
-    return sorted({*sample_evaluation(count, most)})
-
-
-def _url(picture: cv2.typing.MatLike, kind: str) -> str:
-    """A picture of rows x columns x BGR; encoded anew, it has no metadata."""
-    data = cv2.imencode(f".{kind}", picture)[1].tobytes()
-    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
