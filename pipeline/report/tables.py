@@ -61,20 +61,16 @@ class Table:
     varied: str = ""
     open: bool = False
 
-    def select(self, report: Report) -> pd.DataFrame:
-        """The rows of the table as the CSV has them, in the order of tasks, measures and systems."""
-        frame = report.effects if self.source == "effects" else marked(over_seeds(report.scores))
-        rows = ordered(frame.query(self.rows, engine="python"))
-        if self.varied and rows.loc[rows["by"] == "model", self.varied].nunique() < 2:
-            return rows.iloc[:0]
-        return rows
-
     def build(self, report: Report) -> pd.DataFrame:
         """The table as it is shown: text in every cell, headings as column names; no row where nothing was measured.
 
-        What is published is joined by `KEYS`, in columns of their own.
+        Rows are in the order of tasks, measures and systems. What is published is joined by `KEYS`, in columns of their
+        own.
         """
-        rows = self.select(report)
+        frame = report.effects if self.source == "effects" else marked(over_seeds(report.scores))
+        rows = ordered(frame.query(self.rows, engine="python"))
+        if self.varied and rows.loc[rows["by"] == "model", self.varied].nunique() < 2:
+            rows = rows.iloc[:0]
         if self.key == "shipped":  # They are full systems, too.
             rows = rows.assign(moves=moves(report.scores, rows))
         shown: dict[str, list[str]] = {}
