@@ -19,6 +19,7 @@ from pipeline.core.io import ROOT, code_of, sha256, tensor_shapes
 from pipeline.core.layout import SHIPPED
 from pipeline.core.records import Part
 from pipeline.evaluation.intervals import coverage_note
+from pipeline.report.render import WORDS
 from pipeline.training.card import front_matter
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.records import Assignment, Video
@@ -27,13 +28,6 @@ from pipeline.weights.backbones import BACKBONES, reads_weights
 PACKAGES = ("torch", "transformers", "peft", "open_clip_torch", "scipy", "scikit-learn", "dvc")
 NOTES = Path(__file__).with_name("notes.yaml")
 """What only people know about a report: whether its settings were chosen on its test objects before."""
-ARCHITECTURES = {
-    "llama": "Llama",
-    "mistral": "Mistral",
-    "qwen2": "Qwen2",
-    "gpt_neox": "GPT-NeoX",
-    "tf_efficientnet_lite0": "EfficientNet-Lite0",
-}
 UNTOLD = {
     *("scale", "seed", "kernels", "data", "invent", "scenes", "split", "ablation", "evaluate"),
     *("packaged", "tracking", "runtime", "weights", "evaluation"),
@@ -150,7 +144,7 @@ def base_model(root: Path, folder: str) -> dict[str, Any]:
     elif (where / "config.json").is_file():
         config = json.loads((where / "config.json").read_text(encoding="utf-8"))
         name = str(config.get("model_type") or config.get("architecture", kind))
-        kind = ARCHITECTURES.get(name, name)
+        kind = WORDS["architectures"].get(name, name)
     return {
         "folder": named(folder),
         "kind": kind,

@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 from pipeline.cli import app
 from pipeline.report import page as module
 from pipeline.report.page import LARGEST, PAGE, left_to_users, write_page
+from pipeline.report.render import WORDS
 from pipeline.running.errors import UserError
 from tests.checkpoints import edit
 from tests.closure import ROOT
@@ -189,7 +190,7 @@ def test_what_only_users_can_measure_is_missing_until_they_have(said: dict[str, 
     cells = {key: said[key] for key in ("task", "touch") if key in said}
     about = {"source": "videos", "dataset": "avocados", **{k: v for k, v in said.items() if k not in cells}}
     left = {what for _, what, _ in left_to_users([report([score(**cells)], **about)])}
-    assert {key for key, what, _ in module.BY_USER if what not in left} == covered
+    assert {key for key, what, _ in WORDS["by_user"] if what not in left} == covered
 
 
 def test_the_papers_examples_are_shown_right_and_wrong(changed: Path) -> None:
