@@ -109,11 +109,9 @@ class SplitConfig(Section):
     """Which objects are for training, validation and test."""
 
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")] = "paper"
-    """`kfold`, `development`, or what stands behind `split_` in a column of the catalogue's objects.csv."""
+    """`kfold`, or what stands behind `split_` in a column of the catalogue's objects.csv."""
     seed: Seed = 0
-    """Used by development and kfold."""
-    test_objects: Positive = 7
-    """Test objects of the development split."""
+    """Used by kfold."""
     train_objects: Annotated[Whole, Field(ge=0)] = 0
     """`kfold`: train on this many of a fold's training objects, to see how many are enough; 0: all. A larger number
     includes all objects of a smaller one."""

@@ -21,6 +21,7 @@ FORMER = {
     "frames.size": "is called frames.pixels now; write that name",
     "shipped": "is the section `evaluate` now: write evaluate.models=[octopi-small] and evaluate.questions",
     "cross_validation": "is no section any more; remove it: the folds of split.name=kfold test every object once",
+    "split.test_objects": "was of split.name=development; remove it: split.name=kfold tests every object once",
 }
 """Parameters of earlier versions, and what took their place."""
 QUOTED = r"""'.*'|".*\""""
@@ -106,7 +107,7 @@ def compose(name: str, overrides: Sequence[str] = (), conf: Path = CONF) -> Para
     for override in overrides:
         key, equals, value = override.partition("=")
         if not equals:
-            raise UserError(f"{override!r} is no override; write key=value, for example split.name=development")
+            raise UserError(f"{override!r} is no override; write key=value, for example split.name=kfold")
         if kind_of(key.lstrip("+").split(".")) is str and not re.fullmatch(QUOTED, value, re.DOTALL):
             # As it stands: Hydra's grammar would read brackets, commas or blanks of a path.
             texts[key.lstrip("+")] = value

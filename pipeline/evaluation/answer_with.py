@@ -7,18 +7,16 @@ arXiv:2309.02561), which it asks for classes alone. Answers are written to `exte
 
 from __future__ import annotations
 
-import base64
 import hashlib
 import json
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import cv2
 from pydantic import Field
 
 from pipeline.config import Params
@@ -26,23 +24,16 @@ from pipeline.core.io import read_jsonl
 from pipeline.core.layout import EXTERNAL, questions_file
 from pipeline.core.records import Opd, Prediction, Question, Record
 from pipeline.evaluation.outside import asked, record, turns_of
+from pipeline.evaluation.pictures import Show, frames, photos
 from pipeline.evaluation.records import Shown, VisionModel
 from pipeline.running.errors import UserError
 from pipeline.running.progress import track
 from pipeline.running.stage import alone
-from pipeline.tasks import TASKS
-from pipeline.training.sampling import sample_evaluation
 from pipeline.videos.catalogue import Catalogue, load_catalogue
-from pipeline.videos.frames.store import FrameStore, frames_key
+from pipeline.videos.frames.store import frames_key
 
-Show = Callable[[str], list[dict[str, Any]]]
-"""From a video's id to the pictures that stand for it, as parts of a message."""
-
-PHOTO_SUFFIXES = (".jpeg", ".jpg", ".png", ".webp")
 EXAMPLES = 3
 """Most training questions that stand before a question as examples (few-shot)."""
-LONGEST = 1024
-"""Pixels of a photo's longer side that are sent at most."""
 FILTERS = ("content_filter", "content_policy_violation")
 """Codes by which an endpoint says that it will not answer this question, with status 400."""
 KINDS = {
@@ -83,26 +74,23 @@ def ask_all(params: Params, url: str, settings: Mapping[str, Any], shown: Shown,
     if re.search("[@?]", url):
         raise UserError("--endpoint: the URL is written beside the answers; put a key into OPENAI_API_KEY instead")
     name = re.sub(r"[^\w.-]+", "-", f"{settings['model']}-{shown}")
-    place = EXTERNAL / params.report_name / name
+    place, most = EXTERNAL / params.report_name / name, params.frames.per_video
     catalogue = load_catalogue(Path(params.data.catalogue)).called(params.questions.names)
     with alone(f"answer-with@{name}"):
-        questions, most = asked(params), params.frames.per_video
-        every = [(seed, question) for seed, own in questions.items() for question in own]
-        show = _frames(folder, most) if shown is Shown.FRAMES else _photos(folder, [q for _, q in every], most)
-        training = {seed: read_jsonl(questions_file(seed, "train"), Question) for seed in questions}
-        told = {(s, t): instruction(catalogue, shown, training[s], t) for s in questions for t in TASKS}
-        asker = _Asker(url, settings, place / "cache.jsonl")
-        answers: dict[int, list[Prediction]] = {seed: [] for seed in questions}
-        used: dict[str, Reply] = {}
+        every = [(seed, question) for seed, own in asked(params).items() for question in own]
+        training = {seed: read_jsonl(questions_file(seed, "train"), Question) for seed in params.ablation.seeds}
+        show = (frames if shown is Shown.FRAMES else photos)(folder, [question for _, question in every], most)
+        endpoint, used = _Endpoint(url, settings, place / "cache.jsonl"), dict[str, Reply]()
+        answers: dict[int, list[Prediction]] = {seed: [] for seed in training}
         for seed, question in track(every, name, "question"):
             turns = turns_of(question)
-            replies = _converse([told[seed, question.task] + turns[0], *turns[1:]], question.videos, asker, show)
-            outputs = [r.text for r in replies] + [""] * (len(turns) - len(replies))
+            turns[0] = instruction(catalogue, shown, training[seed], question.task) + turns[0]
+            replies = endpoint.converse(turns, question.videos, show)
             used |= {reply.request: reply for reply in replies}
+            said = [*(reply.text for reply in replies), *[""] * (len(turns) - len(replies))]
             cut, tokens = any(r.ended == "length" for r in replies), sum(r.tokens for r in replies)
             whose = {"question_id": question.question_id, "task": question.task}
-            answers[seed].append(Prediction(**whose, outputs=tuple(outputs), truncated=cut, tokens=tokens))
-        days = sorted(reply.day for reply in used.values()) or [""]
+            answers[seed].append(Prediction(**whose, outputs=tuple(said), truncated=cut, tokens=tokens))
         ended = Counter(sorted(reply.ended for reply in used.values()))
         source = VisionModel(
             model=settings["model"],
@@ -110,8 +98,8 @@ def ask_all(params: Params, url: str, settings: Mapping[str, Any], shown: Shown,
             endpoint=url,
             temperature=settings["temperature"],
             max_tokens=settings["max_completion_tokens"],
-            first=days[0],
-            last=days[-1],
+            first=min((reply.day for reply in used.values()), default=""),
+            last=max((reply.day for reply in used.values()), default=""),
             ended=ended,
             shown=shown,
             per_video=most,
@@ -119,8 +107,8 @@ def ask_all(params: Params, url: str, settings: Mapping[str, Any], shown: Shown,
             frames=frames_key(folder) if shown is Shown.FRAMES else "",
         )
         record(params, name, source, answers)
-    how, sent = ", ".join(f"{count} {kind}" for kind, count in ended.items()), len(asker.known) - asker.before
-    return f"{place}: {len(every)} questions answered by {sent} requests ({how}); `dvc repro` grades them"
+    how = ", ".join(f"{count} {kind}" for kind, count in ended.items())
+    return f"{place}: {len(every)} questions answered by {endpoint.sent} requests ({how}); `dvc repro` grades them"
 
 
 def instruction(catalogue: Catalogue, shown: Shown, training: Sequence[Question], task: str) -> str:
@@ -133,8 +121,7 @@ def instruction(catalogue: Catalogue, shown: Shown, training: Sequence[Question]
     for q in training:
         if q.task == task:
             first.setdefault(q.gold.choice, q)
-    examples = list(first.values())[:EXAMPLES]
-    turns = [turn for q in examples for d in q.dialogues if d.opd is Opd.ALL for turn in d.turns]
+    turns = [turn for q in [*first.values()][:EXAMPLES] for d in q.dialogues if d.opd is Opd.ALL for turn in d.turns]
     classes = "; ".join(f"{p.spoken} ({', '.join(p.levels)})" for p in catalogue.properties)
     form = catalogue.language.structured.format(**{p.name: f"<{p.spoken}>" for p in catalogue.properties})
     lines = [
@@ -149,31 +136,13 @@ def instruction(catalogue: Catalogue, shown: Shown, training: Sequence[Question]
     return "\n".join(lines).replace("{tactile}", "[pictures]") + "\n\n"
 
 
-def _converse(turns: Sequence[str], videos: Sequence[str], asker: _Asker, show: Show) -> list[Reply]:
-    """Ask turn after turn, with pictures where a text has `{tactile}`; nothing follows a reply without text."""
-    messages: list[dict[str, Any]] = []
-    replies: list[Reply] = []
-    touched = iter(videos)
-    for turn in turns:
-        content: list[dict[str, Any]] = []
-        for place, text in enumerate(turn.split("{tactile}")):
-            content += show(next(touched)) if place else []
-            content += [{"type": "text", "text": text}] if text else []
-        messages.append({"role": "user", "content": content})
-        replies.append(asker.ask(messages))
-        if not replies[-1].text:
-            break
-        messages.append({"role": "assistant", "content": replies[-1].text})
-    return replies
-
-
-class _Asker:
+class _Endpoint:
     """Replies to conversations: from the cache, else from the endpoint."""
 
     def __init__(self, url: str, settings: Mapping[str, Any], cache: Path) -> None:
         import openai
 
-        self.url, self.settings, self.cache = url, settings, cache
+        self.url, self.settings, self.cache, self.sent = url, settings, cache, 0
         # A server of one's own wants no key, but the client does.
         self.client = openai.OpenAI(base_url=url, api_key=os.environ.get("OPENAI_API_KEY", "").strip() or "none")
         cache.parent.mkdir(parents=True, exist_ok=True)
@@ -182,24 +151,36 @@ class _Asker:
             # Half a line, of a run that was killed while it wrote, is asked for again.
             cache.write_bytes(content[: content.rfind(b"\n") + 1])
         self.known = {reply.request: reply for reply in read_jsonl(cache, Reply)}
-        self.before = len(self.known)
 
-    def ask(self, messages: Sequence[dict[str, Any]]) -> Reply:
-        """The reply to a conversation; UserError where the endpoint fails."""
-        body = {**self.settings, "messages": list(messages)}
-        request = hashlib.sha256(json.dumps([self.url, body], sort_keys=True).encode()).hexdigest()
-        if request not in self.known:
-            self.known[request] = Reply(request=request, **self._send(body))
-            with self.cache.open("a", encoding="utf-8") as stream:
-                stream.write(self.known[request].model_dump_json() + "\n")
-        return self.known[request]
+    def converse(self, turns: Sequence[str], videos: Sequence[str], show: Show) -> list[Reply]:
+        """Ask turn after turn, with pictures where a text has `{tactile}`; nothing follows a reply without text."""
+        messages, replies, touched = list[dict[str, Any]](), list[Reply](), iter(videos)
+        for turn in turns:
+            content: list[dict[str, Any]] = []
+            for place, text in enumerate(turn.split("{tactile}")):
+                urls = show(next(touched)) if place else []
+                content += [{"type": "image_url", "image_url": {"url": url}} for url in urls]
+                content += [{"type": "text", "text": text}] if text else []
+            messages.append({"role": "user", "content": content})
+            sent = json.dumps([self.url, {**self.settings, "messages": messages}], sort_keys=True)
+            request = hashlib.sha256(sent.encode()).hexdigest()
+            if request not in self.known:
+                self.known[request] = self._ask(request, messages)
+                self.sent += 1
+                with self.cache.open("a", encoding="utf-8") as stream:
+                    stream.write(self.known[request].model_dump_json() + "\n")
+            replies.append(self.known[request])
+            if not replies[-1].text:
+                break
+            messages.append({"role": "assistant", "content": replies[-1].text})
+        return replies
 
-    def _send(self, body: dict[str, Any]) -> dict[str, Any]:
-        """What the endpoint says, as fields of a `Reply`; a refusal to answer this question is a reply, too."""
+    def _ask(self, request: str, messages: Any) -> Reply:
+        """What the endpoint says; a refusal to answer this question is a reply, too."""
         import openai
 
         try:
-            completion = self.client.chat.completions.create(**body)
+            completion = self.client.chat.completions.create(**self.settings, messages=messages)
             choice = completion.choices[0]
             # Half a character, which JSON can hold, cannot be written to a file.
             text = (choice.message.content or "").encode(errors="replace").decode().strip()
@@ -207,56 +188,10 @@ class _Asker:
             tokens = completion.usage.completion_tokens if completion.usage else 0
         except (openai.OpenAIError, ValueError, TypeError, AttributeError, IndexError) as error:
             if getattr(error, "status_code", 0) == 400 and getattr(error, "code", "") in FILTERS:
-                return {"ended": FILTERS[0]}
+                return Reply(request=request, ended=FILTERS[0])
             failed = isinstance(error, openai.OpenAIError | ValueError)
             why = str(error.__cause__ or error) if failed else f"no chat completion ({completion}); is the URL right?"
             why = " ".join(why.split()).replace(self.client.api_key, "[key]")[:300]
             raise UserError(f"{self.url}: {why}; what it said before is kept, run it again to go on") from None
         ended = "nothing" if ended == "stop" and not text else ended
-        return {"text": text, "ended": ended, "tokens": tokens, "model": completion.model or ""}
-
-
-def _frames(folder: Path, most: int) -> Show:
-    """Those frames of a video that every variant is given, as PNG: what was kept, bit by bit."""
-    store = FrameStore(folder)
-
-    def show(video_id: str) -> list[dict[str, Any]]:
-        count = len(store.rows(video_id))
-        if not count:
-            raise UserError(f"{folder}: no frame of {video_id}; run `dvc repro extract_frames`")
-        frames = store.pictures(video_id, sorted(set(sample_evaluation(count, most))))
-        return [_picture(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR), "png") for frame in frames]
-
-    return show
-
-
-def _photos(folder: Path, questions: Sequence[Question], most: int) -> Show:
-    """Photos of the object that was touched in a video."""
-    touched = {v: o for q in questions for v, o in zip(q.videos, q.objects, strict=True)}
-    found: dict[str, list[Path]] = {}
-    for name in sorted({*touched.values()}):
-        # Those named after it, and those in the folder of its name.
-        files = [*folder.glob(f"{name}.*"), *(folder / name).glob("[!.]*")]
-        found[name] = sorted(f for f in files if f.suffix.lower() in PHOTO_SUFFIXES)
-        if not found[name]:
-            kinds = ", ".join(PHOTO_SUFFIXES)
-            raise UserError(f"{folder}: no photo of {name}; put {name}.jpg or a folder {name}/ there ({kinds})")
-
-    def show(video_id: str) -> list[dict[str, Any]]:
-        files, pictures = found[touched[video_id]], []
-        for file in (files[i] for i in sorted({*sample_evaluation(len(files), most)})):
-            if (photo := cv2.imread(str(file))) is None:  # Upright, as its camera was held.
-                raise UserError(f"{file}: not a picture that can be read; replace it")
-            scale = min(1.0, LONGEST / max(photo.shape[:2]))
-            small = cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-            pictures.append(_picture(small, "jpeg"))
-        return pictures
-
-    return show
-
-
-def _picture(picture: cv2.typing.MatLike, kind: str) -> dict[str, Any]:
-    """A picture of rows x columns x BGR as a part of a message; encoded anew, it has no metadata."""
-    _, data = cv2.imencode(f".{kind}", picture)
-    url = f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode()}"
-    return {"type": "image_url", "image_url": {"url": url}}
+        return Reply(request=request, ended=ended, text=text, tokens=tokens, model=completion.model or "")

@@ -7,10 +7,10 @@ here by itself once it is registered: its chance, and with it its measures, come
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
 from statistics import fmean
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from statsmodels.stats.multitest import multipletests
@@ -62,8 +62,8 @@ class Answer(NamedTuple):
 
 Runs = Mapping[int, Mapping[str, Answer]]
 """By seed and question."""
-Entry = tuple[Score, Setting, int]
-"""A score, who answered, and the seed."""
+Entry = tuple[tuple[str, str], Setting, int, str, Answer]
+"""Task and measure, who answered, the seed, the question, and its answer."""
 Table = Mapping[tuple[str, str], Mapping[Setting, Runs]]
 """By task and measure, then setting, seed and question."""
 
@@ -83,7 +83,7 @@ def score_rows(
         vision: Graded answers of vision-only models.
         concluded: By seed, the scores that `pipeline.evaluation.grading.conclude` gives.
     """
-    seen = _tabled((g, Setting(g.model, opd=Opd.ALL, touch=g.shown), g.seed) for g in vision)
+    seen = _tabled(_entry(g, Setting(g.model, opd=Opd.ALL, touch=g.shown), g.seed) for g in vision)
     chances, rows = {name: task.chance(catalogue) for name, task in TASKS.items()}, []
     for table in (_answers(graded, catalogue, concluded or {}), seen, _heads(classifications or {}, catalogue)):
         for (task, measure), settings in table.items():
@@ -165,13 +165,14 @@ def _rows(runs: Runs, *, chance: float, **named: str) -> list[ScoreRow]:
     return rows
 
 
-def grouped(graded: Iterable[Graded]) -> Table:
-    """Answers by task and measure, then by setting."""
-    return _tabled(_entries(graded))
+def grouped(graded: Iterable[Graded], order: Iterable[tuple[str, str]] = (), ruled: Iterable[Entry] = ()) -> Table:
+    """Answers by task and measure, then by setting; `order` and `ruled`, other answers, as `_answers` gives them."""
+    own = (_entry(g, Setting(g.encoder, g.lora, g.opd, g.touch), g.seed) for g in graded)
+    return _tabled(chain(own, ruled), order)
 
 
-def _entries(graded: Iterable[Graded]) -> Iterator[Entry]:
-    return ((g, Setting(g.encoder, g.lora, g.opd, g.touch), g.seed) for g in graded)
+def _entry(s: Score, setting: Setting, seed: int) -> Entry:
+    return (s.task, s.measure), setting, seed, s.question_id, Answer(s.correct, s.objects, s.parsed, s.strict)
 
 
 def _tabled(entries: Iterable[Entry], order: Iterable[tuple[str, str]] = ()) -> Table:
@@ -179,16 +180,16 @@ def _tabled(entries: Iterable[Entry], order: Iterable[tuple[str, str]] = ()) -> 
     found: dict[tuple[str, str], dict[Setting, dict[int, dict[str, Answer]]]] = defaultdict(
         lambda: defaultdict(lambda: defaultdict(dict))
     )
-    for s, setting, seed in entries:
-        found[s.task, s.measure][setting][seed][s.question_id] = Answer(s.correct, s.objects, s.parsed, s.strict)
+    for key, setting, seed, question, answer in entries:
+        found[key][setting][seed][question] = answer
     return {key: found[key] for key in order or found if key in found}
 
 
 def _answers(graded: Iterable[Graded], catalogue: Catalogue, concluded: Mapping[int, Sequence[Score]]) -> Table:
     """In the order of the registered tasks and of what each calls its measures."""
-    ruled = ((score, RULES, seed) for seed, scores in concluded.items() for score in scores)
+    ruled = (_entry(score, RULES, seed) for seed, scores in concluded.items() for score in scores)
     order = [(task, measure) for task, definition in TASKS.items() for measure in definition.chance(catalogue)]
-    return _tabled(chain(_entries(graded), ruled), order)
+    return grouped(graded, order, ruled)
 
 
 def _heads(classifications: Mapping[int, Sequence[Classification]], catalogue: Catalogue) -> Table:
@@ -206,10 +207,8 @@ def _heads(classifications: Mapping[int, Sequence[Classification]], catalogue: C
             right[kind, "combined"] = all(right.values())
             for c in own if kind == HEADS else ():
                 right[RECALL, f"{c.property}: {levels[c.property][c.expected]}"] = c.expected == c.predicted
-            same: dict[str, Any] = {"question_id": video, "objects": (own[0].object_id,), "parsed": True}
-            same |= {"truncated": False, "expected": "", "predicted": ""}
-            for (task, measure), correct in right.items():
-                entries.append((Score(task=task, measure=measure, correct=correct, **same), RULES, seed))
+            about = (own[0].object_id,)
+            entries += [(key, RULES, seed, video, Answer(correct, about)) for key, correct in right.items()]
     order = [(kind, measure) for kind in kinds.values() for measure in TASKS["OPD"].chance(catalogue)]
     order += [(RECALL, f"{p.name}: {level}") for p in catalogue.properties for level in p.levels]
     return _tabled(entries, order)

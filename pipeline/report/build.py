@@ -7,7 +7,6 @@ from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
-from statistics import fmean, median
 
 import pandas as pd
 
@@ -158,10 +157,10 @@ def dataset_frame(
         for p, own in zip(catalogue.properties, classes, strict=True)
     ]
     have, every = ([", ".join(words) for words in them] for them in (zip(*classes, strict=True), product(*levels)))
-    found = []
     groups.append(("property_combinations", "", have, every))
     numbers = [str(n) for n in sorted({*filmed.values()})]
     groups.append(("videos_per_object", "", [str(filmed[o]) for o in catalogue.objects], numbers))
+    found = []
     for table, before, own, names in groups:
         rows = objects.groupby(own).sum().reindex(names, fill_value=0)
         beside = [values.get((table, name)) for name in names]
@@ -172,12 +171,10 @@ def dataset_frame(
         rated = [sum(len(catalogue.objects[v.object_id].ratings[i]) for v in videos) for i in range(len(levels))]
         rows = pd.DataFrame({"row": catalogue.property_names, "annotations": rated})
         found.append(rows.astype({"annotations": "Int64"}).assign(table="annotations"))
-        lengths = [v.frames for v in videos]
-        figures = {"average": fmean(lengths), "median": median(lengths)}
-        figures |= {"minimum": float(min(lengths)), "maximum": float(max(lengths))}
-        rows = pd.DataFrame({"row": [*figures], "frames": [*figures.values()]})
+        figures = {"average": "mean", "median": "median", "minimum": "min", "maximum": "max"}
+        frames = pd.Series([float(v.frames) for v in videos]).agg([*figures.values()]).tolist()
         beside = [values.get(("video_lengths", row)) for row in figures]
-        found.append(rows.assign(table="video_lengths", published=beside))
+        found.append(pd.DataFrame({"table": "video_lengths", "row": [*figures], "frames": frames, "published": beside}))
     order = ["table", "row", "objects", "percent", *objects.columns[1:], "annotations", "frames", "published"]
     return pd.concat(found).reindex(columns=order)
 

@@ -17,7 +17,7 @@ from sklearn.metrics import ConfusionMatrixDisplay
 
 from pipeline.core.io import atomic
 from pipeline.report.load import Report
-from pipeline.report.tables import PARTS
+from pipeline.report.render import WORDS
 
 MEASURED, QUIET, LINE, TEXT = "#0a5fb4", "#555b66", "#c9ced6", "#1a1d23"
 SERIES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#000000")
@@ -86,7 +86,7 @@ def draw_effects(effects: pd.DataFrame) -> Figure:
         axes.axvline(0, color=QUIET, linewidth=0.9)
         axes.xaxis.set_major_locator(MaxNLocator(4, prune="both"))
         axes.set(xlim=(-reach, reach), ylim=(-len(labels) + 0.4, 0.6), xlabel="points")
-        axes.set_title(f"{PARTS.get(part, part)}\n{change}")
+        axes.set_title(f"{WORDS['parts'].get(part, part)}\n{change}")
         axes.set_yticks([-i for i in range(len(labels))], names if number % 4 == 0 else [""] * len(labels))
         axes.grid(axis="x")
     return figure

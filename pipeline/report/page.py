@@ -21,8 +21,8 @@ from markupsafe import Markup
 from pipeline.config.params import PARAMS_FILE, load_params
 from pipeline.core.io import write_text
 from pipeline.report.load import Report, load_report, published, read_frame
-from pipeline.report.readme import OTHER_MODELS, sections
-from pipeline.report.render import Block, render
+from pipeline.report.readme import sections
+from pipeline.report.render import WORDS, Block, render
 from pipeline.report.tables import TABLES, side_by_side
 from pipeline.running.errors import UserError
 
@@ -32,29 +32,8 @@ LARGEST = 1_500_000
 SPEED = ("question", "setting", "cost", "unit", "cost_ratio", "error", "error_of", "low", "high", "front")
 STABILITY = ("part", "case", "format", "finite", "error", "bound", "verdict")
 AUDIT = ("check", "item", "measured", "expected", "severity")
-DATASET = {
-    "property_counts": "Property categories: objects a class",
-    "property_combinations": "Property combinations: objects each",
-    "videos_per_object": "Videos an object: objects that have so many",
-    "annotations": "Annotations: raters of each video, as those of its object",
-    "video_lengths": "Video lengths, in frames that decode",
-}
-"""The tables of dataset.csv."""
 Gap = tuple[str, str, str]
 """Where something is missing, what, and why."""
-BY_USER = (
-    ("paper-7b-videos", "Octopi with Vicuna 7b", "needs a GPU of 48 GB, the videos and the weights (`README.md`)"),
-    ("paper-13b-videos", "Octopi with Vicuna 13b", "needs two such GPUs, the videos and the weights (`README.md`)"),
-    ("RIPE", "avocados, described and compared", "needs videos of ten and their ranks of ripeness (`docs/avocado.md`)"),
-    (
-        "avocados photos",
-        "a model that only sees them, in place of PG-InstructBLIP",
-        "needs photos of the avocados and a model's endpoint (`octopi answer-with`)",
-    ),
-    ("robot", "the arm that sorts avocados", "needs one with such a sensor; it asks a trained model (`docs/robot.md`)"),
-)
-"""Results of the paper that only a user can measure. For each: what in a report on real videos would show it (the
-report's name, a task, or the data set and what was shown in place of touch), what it is, and what it needs."""
 
 
 def write_page(root: Path) -> Path:
@@ -74,13 +53,11 @@ def write_page(root: Path) -> Path:
             gaps.append((place.name, "the whole report", f"its provenance.json lacks {error}; write it anew"))
     if not chapters:
         raise UserError(f"{folder}: no whole report yet; `make repro` writes one")
-    # The current report, then real videos, scenes, looked-at test objects, smoke.
-    chapters.sort(
-        key=lambda c: (not c["current"], c["scale"] == "smoke", c["looked_at"] != "", c["source"] != "videos")
-    )
+    # The current report, then real videos, scenes, smoke.
+    chapters.sort(key=lambda c: (not c["current"], c["scale"] == "smoke", c["source"] != "videos"))
     gaps += left_to_users([c["report"] for c in chapters])
     # What random models answer is chance, and nothing to hold against the paper.
-    reports = {c["name"] + ("†" if c["looked_at"] else ""): c["report"] for c in chapters if not c["plumbing"]}
+    reports = {c["name"]: c["report"] for c in chapters if not c["plumbing"]}
     stability = _measured(folder / "stability.csv", STABILITY, gaps)
     style = " ".join(render("style.css").split())
     text = render(
@@ -89,7 +66,7 @@ def write_page(root: Path) -> Path:
         digest=base64.b64encode(hashlib.sha256(style.encode()).digest()).decode(),
         chapters=chapters,
         paper=[side_by_side(reports, every=every) for every in (False, True)] if reports else [],
-        other_models=OTHER_MODELS,
+        other_models=WORDS["other_models"],
         speed=list(_speed(folder, gaps)),
         cases=len(stability),
         failed=_shown(stability[stability["verdict"] != "pass"]),
@@ -132,7 +109,7 @@ def data_tables(folder: Path, dataset: str) -> Iterator[Block]:
         for key, rows in frame.groupby("table", sort=False):
             shown = rows.drop(columns="table").loc[:, lambda f: (f != "").any()]
             shown = _named(shown).rename(columns={"Row": ""})
-            yield Block(str(key), DATASET[str(key)], "", shown, "dataset.csv")
+            yield Block(str(key), WORDS["dataset"][str(key)], "", shown, "dataset.csv")
     audit = read_frame(folder / "audit.csv", AUDIT)
     audit["measured"] = audit["measured"].astype(str)
     rows = audit[audit["check"] == "agreement, ICC(3,k)"]
@@ -156,11 +133,11 @@ def data_tables(folder: Path, dataset: str) -> Iterator[Block]:
 
 
 def left_to_users(reports: Iterable[Report]) -> list[Gap]:
-    """The entries of `BY_USER` that no report covers."""
+    """What only users can measure and no report covers, of `by_user` in words.yaml."""
     filmed = [r for r in reports if r.provenance["source"] == "videos"]
     known = {name for r in filmed for name in (r.folder.name, *r.scores["task"])}
     known |= {f"{r.provenance['dataset']} {touch}" for r in filmed for touch in r.scores["touch"]}
-    return [("paper", what, why) for name, what, why in BY_USER if name not in known]
+    return [("paper", what, why) for name, what, why in WORDS["by_user"] if name not in known]
 
 
 def _speed(folder: Path, gaps: list[Gap]) -> Iterator[dict[str, Any]]:

@@ -19,22 +19,15 @@ from pipeline.core.io import ROOT, code_of, sha256, tensor_shapes
 from pipeline.core.layout import SHIPPED
 from pipeline.core.records import Part
 from pipeline.evaluation.intervals import coverage_note
+from pipeline.report.render import WORDS
 from pipeline.training.card import front_matter
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.records import Assignment, Video
 from pipeline.weights.backbones import BACKBONES, reads_weights
 
 PACKAGES = ("torch", "transformers", "peft", "open_clip_torch", "scipy", "scikit-learn", "dvc")
-UNKNOWN = "unknown"
 NOTES = Path(__file__).with_name("notes.yaml")
 """What only people know about a report: whether its settings were chosen on its test objects before."""
-ARCHITECTURES = {
-    "llama": "Llama",
-    "mistral": "Mistral",
-    "qwen2": "Qwen2",
-    "gpt_neox": "GPT-NeoX",
-    "tf_efficientnet_lite0": "EfficientNet-Lite0",
-}
 UNTOLD = {
     *("scale", "seed", "kernels", "data", "invent", "scenes", "split", "ablation", "evaluate"),
     *("packaged", "tracking", "runtime", "weights", "evaluation"),
@@ -62,9 +55,10 @@ def provenance(
     rows = "\n".join(video.model_dump_json() for video in videos)
     test = {a.video_id: a.object_id for assignments in splits for a in assignments if a.part is Part.TEST}
     seeds, split = params.ablation.seeds, params.split
-    based: tuple[str, ...] = ("encoder", "language") if reads_weights(params.encoder) else ("language",)
-    if not params.ablation.train:
-        based = ()
+    based = ["language"] if params.ablation.train else []
+    if based and reads_weights(params.encoder):
+        based.insert(0, "encoder")
+    backbones = [BACKBONES[name] for name in params.encoder.backbone]
     folds = sorted({fold for seed in seeds if (fold := split.fold_of(seed)) is not None})
     notes: dict[str, str] = yaml.safe_load(NOTES.read_text(encoding="utf-8")).get(catalogue.language.dataset, {})
     return {
@@ -80,8 +74,8 @@ def provenance(
         "seeds": list(seeds),
         "folds": {"of": split.folds, "tested": folds, "trained": split.train_objects} if folds else None,
         "replicates": len({split.replicate_of(seed) for seed in seeds}),
-        # What people noted about the test objects of this report, or else of its split. Other data has other objects.
-        "settings": notes.get(f"{params.report_name}/{split.name}", notes.get(split.name, "")),
+        # What people noted about its test objects. Other data has other objects.
+        "settings": notes.get(f"{params.report_name}/{split.name}", ""),
         "intervals": coverage_note(asked),
         "facts_told": params.questions.facts,
         "beyond_paper": beyond_paper(params, root / CONF) if based else {},
@@ -94,15 +88,10 @@ def provenance(
         "encoder": encoder_words(params.encoder) if based else "",
         "base_models": {part: base_model(root, getattr(params, part).weights) for part in based},
         # In words, those of the base encoder's backbones that the chain pretrains itself.
-        "own_backbones": [BACKBONES[b].words for b in params.encoder.backbone if based and not reads(b)],
+        "own_backbones": [own.words for own in backbones if based and own.key != "weights"],
         "python": ".".join(platform.python_version_tuple()[:2]),
         "packages": {name: metadata.version(name) for name in PACKAGES},
     }
-
-
-def reads(backbone: str) -> bool:
-    """Whether a backbone reads `encoder.weights`."""
-    return BACKBONES[backbone].key == "weights"
 
 
 def evaluated(models: Sequence[str]) -> list[dict[str, str]]:
@@ -155,7 +144,7 @@ def base_model(root: Path, folder: str) -> dict[str, Any]:
     elif (where / "config.json").is_file():
         config = json.loads((where / "config.json").read_text(encoding="utf-8"))
         name = str(config.get("model_type") or config.get("architecture", kind))
-        kind = ARCHITECTURES.get(name, name)
+        kind = WORDS["architectures"].get(name, name)
     return {
         "folder": named(folder),
         "kind": kind,
@@ -174,7 +163,7 @@ def digest(folder: Path) -> str:
     """SHA-256 over the names and hashes of a folder's files, hidden ones (downloads leave them) left out."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     shown = [file for file in files if not any(part.startswith(".") for part in file.relative_to(folder).parts)]
-    return hash_of(shown, folder) if shown else UNKNOWN
+    return hash_of(shown, folder) if shown else "unknown"
 
 
 def hash_of(files: Sequence[Path], folder: Path = ROOT) -> str:

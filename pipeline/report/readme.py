@@ -9,19 +9,13 @@ from collections.abc import Sequence
 from typing import Any
 
 from pipeline.report.load import Report
-from pipeline.report.render import render, size
-from pipeline.report.tables import FIVE_TASKS, PARTS, SHIPPED_TABLE, SHOWN_WORDS, TABLES, headline
+from pipeline.report.render import WORDS, render, size
+from pipeline.report.tables import FIVE_TASKS, SHIPPED_TABLE, TABLES, headline
 from pipeline.weights import is_random
 
-PLUMBING = "The chain's own models at this scale are random ones: a test of the plumbing"
 ALPHA = 0.05
 VICUNA = 5e9
 """Parameters below which a language model is no Vicuna 7b."""
-OTHER_QUESTIONS = "Published figures are the paper's, from its own questions about its own test objects."
-OTHER_MODELS = (
-    "Published figures are the paper's, of Octopi with Vicuna 7b and 13b (and of CLIP ViT-L/14 where no language model "
-    "answers): other models on other questions about other objects. They are no target that was met or missed."
-)
 
 
 def render_readme(report: Report, figures: Sequence[str]) -> str:
@@ -37,10 +31,10 @@ def sections(report: Report) -> dict[str, Any]:
     Returns:
         `name`; `trained`, whether the run has models of its own; `shipped`, how models that were trained before answer
         about its videos, and `tasks`, the full system's answers: a `Block` each, or None; `tables`, the other blocks of
-        the registry; `finding`; `plumbing`, a warning where a base model is a random one; `looked_at`, how recipes were
-        chosen by the test objects, if these are the development split's; `other_models`, where published figures stand
-        beside; `stands_on`, what a figure is worth: models with their size, test objects, seeds; `beyond`, the settings
-        that its last fact counts; `origin`: command, hash of the code, data, models by hash, packages.
+        the registry; `finding`; `plumbing`, a warning where a base model is a random one; `other_models`, where
+        published figures stand beside; `stands_on`, what a figure is worth: models with their size, test objects,
+        seeds; `beyond`, the settings that its last fact counts; `origin`: command, hash of the code, data, models by
+        hash, packages.
     """
     said, shipped = report.provenance, SHIPPED_TABLE.block(report)
     trained = bool(said["base_models"])
@@ -60,10 +54,9 @@ def sections(report: Report) -> dict[str, Any]:
         "tasks": tasks,
         "tables": [block for table in TABLES if (block := table.block(report))],
         "finding": finding(report),
-        "plumbing": PLUMBING if at_random(said) else "",
-        "looked_at": said["settings"] if said["split"] == "development" else "",
-        "other_models": (OTHER_MODELS if trained else OTHER_QUESTIONS) if len(report.published) else "",
-        "stands_on": render("stands_on.md", said=said, shown=SHOWN_WORDS).splitlines(),
+        "plumbing": WORDS["plumbing"] if at_random(said) else "",
+        "other_models": WORDS["other_models" if trained else "other_questions"] if len(report.published) else "",
+        "stands_on": render("stands_on.md", said=said, shown=WORDS["shown"]).splitlines(),
         "beyond": render("beyond.md", said=said).strip(),
         "origin": render("origin.md", said=said).splitlines(),
     }
@@ -87,7 +80,7 @@ def finding(report: Report) -> list[str]:
         tasks=len(rows),
         above=list(above),
         below=list(rows.loc[rows["high"] < rows["chance"], "task"]),
-        effects=effects.assign(part=effects["part"].replace(PARTS)).to_dict("records"),
+        effects=effects.assign(part=effects["part"].replace(WORDS["parts"])).to_dict("records"),
         sure=sure.to_dict("records"),
         few=effects["objects"].max() if few else 0,
     )

@@ -18,34 +18,12 @@ from pipeline.core.records import Touch
 from pipeline.evaluation.records import Shown
 from pipeline.evaluation.rows import ALL_SEEDS, HEADS, RECALL, VALIDATION_HEADS
 from pipeline.report.load import DATASET, DATASETS, KEYS, Report, published
-from pipeline.report.render import Block
+from pipeline.report.render import WORDS, Block
 from pipeline.tasks import TASKS
 
 FULL = {"encoder": "finetuned", "lora": "with", "opd": "all"}
 CHOICE, COMBINED = "choice", "combined"
-NOT_ANSWERED = {
-    HEADS: "Property heads",
-    VALIDATION_HEADS: "Property heads, validation videos",
-    RECALL: "Property heads, class by class",
-}
-"""Tasks of scores.csv that no language model with touch answered, in words."""
 PUBLISHED_MODELS = ("7b", "13b", "CLIP", "PG-InstructBLIP")
-SYSTEM_WORDS = {
-    "base": "base encoder",
-    "words": "told the heads' classes in words",
-    "without": "without LoRA",
-    "none": "without OPD",
-    "needed": "OPD as needed",
-}
-SHOWN_WORDS = {
-    "frames": "frames of the videos",
-    "photos": "photos of the objects",
-    "answers from outside": "answered outside this project",
-}
-"""What models that this project does not run were shown, in the place where others have their touch."""
-ENCODERS = {"finetuned": "fine-tuned", "base": "base", "words": "fine-tuned, its classes in words"}
-PARTS = {"language": "language model", "lora": "LoRA", "opd": "OPD"}
-"""Parts of the full system that are called otherwise than in effects.csv."""
 
 
 @dataclass(frozen=True)
@@ -61,20 +39,16 @@ class Table:
     varied: str = ""
     open: bool = False
 
-    def select(self, report: Report) -> pd.DataFrame:
-        """The rows of the table as the CSV has them, in the order of tasks, measures and systems."""
-        frame = report.effects if self.source == "effects" else marked(over_seeds(report.scores))
-        rows = ordered(frame.query(self.rows, engine="python"))
-        if self.varied and rows.loc[rows["by"] == "model", self.varied].nunique() < 2:
-            return rows.iloc[:0]
-        return rows
-
     def build(self, report: Report) -> pd.DataFrame:
         """The table as it is shown: text in every cell, headings as column names; no row where nothing was measured.
 
-        What is published is joined by `KEYS`, in columns of their own.
+        Rows are in the order of tasks, measures and systems. What is published is joined by `KEYS`, in columns of their
+        own.
         """
-        rows = self.select(report)
+        frame = report.effects if self.source == "effects" else marked(over_seeds(report.scores))
+        rows = ordered(frame.query(self.rows, engine="python"))
+        if self.varied and rows.loc[rows["by"] == "model", self.varied].nunique() < 2:
+            rows = rows.iloc[:0]
         if self.key == "shipped":  # They are full systems, too.
             rows = rows.assign(moves=moves(report.scores, rows))
         shown: dict[str, list[str]] = {}
@@ -108,11 +82,11 @@ def marked(scores: pd.DataFrame) -> pd.DataFrame:
     """
 
     def by(task: str, lora: str, touch: str) -> str:
-        if task in NOT_ANSWERED:
+        if task in WORDS["tasks"]:
             return task
         if touch == Touch.REAL:
             return "model" if lora else "rules"
-        return "vision" if touch in SHOWN_WORDS else "shipped" if touch in {*Shown} else "other touch"
+        return "vision" if touch in WORDS["shown"] else "shipped" if touch in {*Shown} else "other touch"
 
     def lacks(*axes: str) -> str:
         own = zip(FULL.items(), axes, strict=True)
@@ -142,7 +116,7 @@ def headline(scores: pd.DataFrame) -> pd.DataFrame:
 
 def ordered(frame: pd.DataFrame) -> pd.DataFrame:
     """Tasks in the registry's order, whole answers before parts, the full system before what lacks something."""
-    tasks = {task: place for place, task in enumerate((*TASKS, *NOT_ANSWERED))}
+    tasks = {task: place for place, task in enumerate((*TASKS, *WORDS["tasks"]))}
     rank = pd.DataFrame({"task": frame["task"].map(lambda task: tasks.get(task, len(tasks)))}, index=frame.index)
     rank["measure"] = frame["measure"] != COMBINED
     rank["named"] = pd.factorize(frame["measure"])[0]
@@ -217,7 +191,7 @@ def difference(row: dict[str, Any]) -> str:
 
 def task_title(task: str) -> str:
     """What a task is called in words, such as "Property comparison (PC)"."""
-    return f"{TASKS[task].title} ({task})" if task in TASKS else NOT_ANSWERED.get(task, task)
+    return f"{TASKS[task].title} ({task})" if task in TASKS else WORDS["tasks"].get(task, task)
 
 
 def system(row: dict[str, Any]) -> str:
@@ -229,7 +203,7 @@ def system(row: dict[str, Any]) -> str:
         Shown.TOUCH: f"{encoder}, as it is",
         Shown.CLASSES: f"its heads and rules alone{told}",
         Shown.STANDARDISED: f"{encoder}, embeddings standardised by these videos",
-        **{shown: f"{encoder}, {words}" for shown, words in SHOWN_WORDS.items()},
+        **{shown: f"{encoder}, {words}" for shown, words in WORDS["shown"].items()},
     }
     if touch in others:
         return others[touch]
@@ -237,7 +211,7 @@ def system(row: dict[str, Any]) -> str:
         return "property heads, no language model"
     if not row["lora"]:
         return f"heads and rules, no language model{told}"
-    words = [SYSTEM_WORDS[row[axis]] for axis in FULL if row[axis] in SYSTEM_WORDS]
+    words = [WORDS["lacks"][row[axis]] for axis in FULL if row[axis] in WORDS["lacks"]]
     return ", ".join(words) or "Octopi (full system)"
 
 
@@ -245,7 +219,7 @@ COLUMNS: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
     "task": ("Task", lambda row: task_title(row["task"])),
     "measure": ("Measure", lambda row: "all properties right" if row["measure"] == COMBINED else row["measure"]),
     "system": ("System", system),
-    "encoder": ("Encoder", lambda row: str(ENCODERS.get(row["encoder"], row["encoder"]))),
+    "encoder": ("Encoder", lambda row: str(WORDS["encoders"].get(row["encoder"], row["encoder"]))),
     "lora": ("LoRA", itemgetter("lora")),
     "opd": ("OPD", itemgetter("opd")),
     "touch": ("Touch", itemgetter("touch")),

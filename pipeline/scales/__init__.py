@@ -24,7 +24,7 @@ from pipeline.scenes.invented import catalogue_of
 from pipeline.tasks.questions import counts_by_task
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import list_videos, raise_errors
-from pipeline.videos.split import FEWEST_TRAINING_OBJECTS, assign_objects, untested
+from pipeline.videos.split import assign_objects, untested
 from pipeline.weights.backbones import check_encoder
 from pipeline.weights.check import check_encoder_files, check_language_files
 
@@ -82,7 +82,7 @@ def check_objects(params: Params, catalogue: Catalogue) -> str:
         where = f"split.name={params.split.name}" + (f", fold {fold}" if fold is not None else "")
         if fold is None and (absent := untested(parts, present)):
             lacking = f"{where}: {absent}"
-        if len(training) < FEWEST_TRAINING_OBJECTS:
+        if len(training) < 3:
             mend = "raise split.train_objects" if params.split.train_objects else "choose another split.name"
             raise UserError(
                 f"{where}: {len(training)} training objects have videos, but questions about three objects need three; "

@@ -10,8 +10,8 @@ and g . grad h to first order, as in a calibrated GelSight (Johnson and Adelson 
 lights stand beside the gel, so that directions and gains change over the picture (Wang et al. 2021, GelSight Wedge: the
 place in the picture is part of their calibration; Gomes, Paoletti and Luo 2021 simulate such sensors likewise).
 
-Everything below was measured on no-contact frames and on frames in full contact of the development split's 53 training
-objects, nothing on other objects.
+Everything below was measured on no-contact frames and on frames in full contact of 53 of the paper's training objects,
+nothing on other objects.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What the hand does: rest, press, twist under force, let go, as in the public videos.
 
-The figures below were measured on the videos of the development split's 53 training objects, from each video's contact
+The figures below were measured on the videos of 53 of the paper's training objects, from each video's contact
 strength over time (`pipeline.videos.frames.reference.contact_strength` against the first frames, over what remains
 once the object is gone). A video's contact strength grows about as the force does: for a ball the sum of |slope| over
 the contact goes as a^3 / R, which is F / E* by Hertz. So it stands for the force over time; the force in N is unknown.

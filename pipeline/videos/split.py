@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from operator import eq
 from pathlib import Path
@@ -14,18 +13,12 @@ from pipeline.core.layout import split_file
 from pipeline.core.records import Part
 from pipeline.core.runtime import derive_seed
 from pipeline.running.errors import UserError
-from pipeline.videos.catalogue import RULED_SPLITS, Catalogue
+from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.records import Assignment, Video
 
-CANDIDATES = 2000
-"""Number of random sets of test objects; the development split takes the most balanced one."""
-FEWEST_TRAINING_OBJECTS = 3
-"""A superlative or a matching question needs three objects."""
 VALIDATION = 8
 """With kfold, one in so many of the objects that are not tested is for validation; a whole fold would leave too few to
 train on."""
-ORIGIN = "paper"
-"""The split of the catalogue that the development split is made from."""
 
 
 def assign(catalogue: Catalogue, videos: Sequence[Video], config: SplitConfig, seed: int = 0) -> list[Assignment]:
@@ -41,26 +34,23 @@ def assign_objects(
 ) -> dict[str, Part]:
     """The part of each object under one seed, by id.
 
-    `development` tests on some of the paper's training objects and leaves the paper's test objects unused. `kfold`
-    deals all objects that have videos into folds: the seed's fold is for test, so that over all folds every object is
-    tested once. One in eight of the other objects is for validation. Of the rest, `train_objects` are for training (0:
-    all). Any other name is that of a `split_` column of the catalogue. `present` are the objects that have videos. Only
-    the split of kfold depends on `seed` (one of `ablation.seeds`).
+    `kfold` deals all objects that have videos into folds: the seed's fold is for test, so that over all folds every
+    object is tested once. One in eight of the other objects is for validation. Of the rest, `train_objects` are for
+    training (0: all). Any other name is that of a `split_` column of the catalogue. `present` are the objects that have
+    videos. Only the split of kfold depends on `seed` (one of `ablation.seeds`).
 
     Raises:
-        UserError: if there is no such split, no training video remains, there are too few objects for the test
-            objects or folds asked for, or (with `missing: error`) a validation or test object has no video.
+        UserError: if there is no such split, no training video remains, there are too few objects for the folds asked
+            for, or (with `missing: error`) a validation or test object has no video.
     """
-    columns, name = catalogue.split_names, config.name
-    ruled = [rule for rule in RULED_SPLITS if rule != "development" or ORIGIN in columns]
-    if name not in (*columns, *ruled):
-        why = f" needs the column split_{ORIGIN}" if name in RULED_SPLITS else " is no split of the catalogue"
-        raise UserError(f"split.name={name}{why}; allowed: {', '.join((*columns, *ruled))} (see objects.csv)")
+    name, allowed = config.name, [*catalogue.split_names, "kfold"]
+    if name not in allowed:
+        # Of earlier versions.
+        why = "is split.name=kfold now" if name == "development" else "is no split of the catalogue"
+        raise UserError(f"split.name={name} {why}; allowed: {', '.join(allowed)} (see objects.csv)")
     fold = config.fold_of(seed)
     if fold is not None:
         parts = _deal(catalogue, present, config, fold)
-    elif name == "development":
-        parts = _develop(catalogue, present, config)
     else:
         parts = {o.object_id: o.splits[name] for o in catalogue.objects.values()}
     if config.missing == "error" and (lacking := without_videos(parts, present)):
@@ -132,33 +122,3 @@ def _balanced(labels: Mapping[str, tuple[int, ...]], count: int, seed: int) -> l
         open_groups = [members for members in groups if len(members) == smallest]
         min(open_groups, key=lambda members: sum(sum(map(eq, labels[o], labels[m])) for m in members)).append(o)
     return groups
-
-
-def _develop(catalogue: Catalogue, present: Collection[str], config: SplitConfig) -> dict[str, Part]:
-    """The paper's split with its test objects unused and a balanced choice of its training objects for test."""
-    paper = {o.object_id: o.splits[ORIGIN] for o in catalogue.objects.values()}
-    candidates = sorted(o for o, part in paper.items() if part == Part.TRAIN and o in present)
-    most = len(candidates) - FEWEST_TRAINING_OBJECTS
-    if config.test_objects > most:
-        raise UserError(
-            f"split.test_objects is {config.test_objects}, but {len(candidates)} training objects with videos allow "
-            f"{max(most, 0)} ({FEWEST_TRAINING_OBJECTS} must be left to train on); lower it or add videos"
-        )
-
-    def shares(objects: Collection[str]) -> dict[tuple[int, int], float]:
-        """The share of each class (property index, level) among the objects."""
-        found: dict[tuple[int, int], float] = defaultdict(float)
-        for object_id in objects:
-            for key in enumerate(catalogue.labels(object_id)):
-                found[key] += 1 / len(objects)
-        return found
-
-    def distance(objects: Collection[str]) -> float:
-        """Sum of squared differences of shares; a choice has no class that the whole lacks."""
-        some = shares(objects)
-        return sum((some.get(key, 0.0) - share) ** 2 for key, share in whole.items())
-
-    whole, rng = shares(candidates), random.Random(derive_seed(config.seed, "development"))
-    chosen = min((rng.sample(candidates, config.test_objects) for _ in range(CANDIDATES)), key=distance)
-    held_out = {**dict.fromkeys(candidates, Part.TRAIN), **dict.fromkeys(chosen, Part.TEST)}
-    return {o: held_out.get(o, Part.UNUSED if part == Part.TEST else part) for o, part in paper.items()}

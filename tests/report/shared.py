@@ -22,7 +22,7 @@ loss,large,bfloat16,False,0.5,0.25,fail
 def write_reports(root: Path, *names: str) -> Path:
     """reports/ with what the page shows: the report of `smoke` under each of these names, speed and stability.
 
-    Where a name is of another scale, the base models have its, and the test objects were looked at.
+    Where a name is of another scale, the base models are none of the random ones.
     """
     reports = root / "reports"
     for name in names:
@@ -35,8 +35,6 @@ def write_reports(root: Path, *names: str) -> Path:
             edit(
                 file,
                 base_models={part: {**model, "folder": f"weights/{part}"} for part, model in models.items()},
-                split="development",
-                settings="Recipes were chosen on them.",
             )
     shutil.copy(ROOT / "reports" / "speed_error.csv", reports)
     shutil.copytree(ROOT / "reports" / "speed_error", reports / "speed_error")

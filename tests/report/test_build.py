@@ -191,6 +191,18 @@ def test_the_stage_does_not_load_a_network() -> None:
     assert done.stdout.strip() == "[]"
 
 
+def evaluated(root: Path, model: str, *right: int) -> None:
+    """What a model that was trained before answered to 40 comparisons in each set, so many of them rightly."""
+    said = {"task": "PC", "measure": "choice", "model": model, "shown": Shown.TOUCH, "parsed": True}
+    said |= {"truncated": False, "expected": "yes", "predicted": "yes"}
+    rows = [
+        GradedVision(question_id=f"PC-{i}-{s}", correct=i < count, objects=(f"o{i}", f"p{i}"), seed=s, **said)
+        for s, count in enumerate(right)
+        for i in range(40)
+    ]
+    write_table(root / "data" / "evaluated.parquet", GradedVision, rows)
+
+
 def test_the_shipped_models_answers_come_first_and_the_plumbing_is_folded(tmp_path: Path) -> None:
     """In the README and on the page, where it was asked; its figures are no other system's."""
     params = write_run(tmp_path, fake_params(*ONE, "questions.evaluation={opd:4,pc:4,pss:4,pom:0,psr:4}"))
@@ -198,13 +210,7 @@ def test_the_shipped_models_answers_come_first_and_the_plumbing_is_folded(tmp_pa
     assert [name for name in metrics if name.isupper()] == ["OPD", "PC", "PSS", "PSR"]
     usual = load_report(tmp_path / "reports" / params.report_name)
     assert "Models that were trained before" not in (usual.folder / "README.md").read_text()
-    common = {"measure": "choice", "parsed": True, "truncated": False, "expected": "yes", "predicted": "yes", "seed": 0}
-    said = {"task": "PC", "model": "octopi-small", "shown": Shown.TOUCH, **common}
-    rows = [
-        GradedVision(question_id=f"PC-test-{i:05d}", correct=i < 30, objects=(f"o{i}", f"p{i}"), **said)
-        for i in range(40)
-    ]
-    write_table(tmp_path / "data" / "evaluated.parquet", GradedVision, rows)
+    evaluated(tmp_path, "octopi-small", 30)
     write_report(params, tmp_path)
     report = load_report(tmp_path / "reports" / params.report_name)
     text = (report.folder / "README.md").read_text()
@@ -223,14 +229,7 @@ def test_a_run_that_trains_nothing_reports_models_that_were_trained_before(tmp_p
     """With sets of different questions, whose accuracies stand beside the interval over all of them."""
     only = ("ablation.train=false", "questions.evaluation={opd:0,pc:4,pss:0,pom:0,psr:0}")
     params = write_run(tmp_path, fake_params(*ONE, *only))
-    common = {"measure": "choice", "parsed": True, "truncated": False, "expected": "yes", "predicted": "yes"}
-    said = {"task": "PC", "model": "octopi-7b", "shown": Shown.TOUCH, **common}
-    rows = [
-        GradedVision(question_id=f"PC-{i}-{s}", correct=i < 20 + 5 * s, objects=(f"o{i}", f"p{i}"), seed=s, **said)
-        for i in range(40)
-        for s in range(3)
-    ]
-    write_table(tmp_path / "data" / "evaluated.parquet", GradedVision, rows)
+    evaluated(tmp_path, "octopi-7b", 20, 25, 30)
     assert write_report(params, tmp_path) == {"octopi-7b_PC": 0.625}
     text = (tmp_path / "reports" / params.report_name / "README.md").read_text()
     assert "| octopi-7b, as it is | 62.5 [" in text

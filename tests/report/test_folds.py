@@ -83,12 +83,12 @@ def test_effects_are_paired_within_a_fold(twice: Path) -> None:
 
 
 def test_one_fold_of_three_is_reported_as_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With what was noted of this report, and not what of all reports under such a split, or of other data."""
-    (tmp_path / "notes.yaml").write_text("PhysiCLeAR:\n  kfold: of all\n  smoke-scenes/kfold: of this one\n")
+    """With what was noted of this report, and not of one on other data."""
+    (tmp_path / "notes.yaml").write_text("PhysiCLeAR:\n  smoke-scenes/kfold: of this one\n")
     monkeypatch.setattr("pipeline.report.provenance.NOTES", tmp_path / "notes.yaml")
     folder = run(tmp_path, "[1]")
     assert load_report(folder).provenance["settings"] == "of this one"
-    (tmp_path / "notes.yaml").write_text("others:\n  kfold: of all\n  smoke-scenes/kfold: of this one\n")
+    (tmp_path / "notes.yaml").write_text("others:\n  smoke-scenes/kfold: of this one\n")
     assert load_report(run(tmp_path / "other", "[1]")).provenance["settings"] == ""
     assert load_report(folder).provenance["folds"] == {"of": 3, "tested": [1], "trained": 0}
     graded = read_table(tmp_path / "data" / "graded.parquet", Graded)

@@ -132,7 +132,7 @@ def test_every_fold_is_audited(workplace: Path, catalogue: Catalogue) -> None:
 @pytest.fixture(scope="module")
 def public(real_data: Path, catalogue: Catalogue) -> list[Finding]:
     """Of the public videos, with the audit's own number of permutations: `few_permutations` begins after it."""
-    return audit_folder(real_data, catalogue, SplitConfig(name="development"))
+    return audit_folder(real_data, catalogue, SplitConfig(name="kfold"))
 
 
 @pytest.mark.slow
@@ -155,7 +155,7 @@ def test_odd_public_videos_are_found_without_being_told(public: list[Finding]) -
     assert len(unclear) <= 25
     shared = of(public, "session in two parts")
     assert {f.severity for f in shared} == {WARNING}
-    assert len(of(public, "session")) >= len(shared)
+    assert {f.item for f in shared} <= {f.item for f in of(public, "session")}
     hardness = of(public, "predicted from the no-contact reference alone")[0]
     assert (hardness.item, hardness.severity) == ("hardness", WARNING)
     assert float(hardness.measured.split()[0]) == pytest.approx(52, abs=6)

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.config import SplitConfig
@@ -20,9 +20,6 @@ from tests.conftest import ROOT, fake_videos, refused
 
 CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
 OBJECTS = sorted(CATALOGUE.objects)
-NAMES = ["paper", "release", "development", "kfold"]
-OF_PAPER = {part: {o for o in OBJECTS if CATALOGUE.objects[o].splits["paper"] == part} for part in Part}
-TRAIN = OF_PAPER[Part.TRAIN]
 
 
 def parts(objects: Iterable[str] = OBJECTS, fold: int = 0, **config: Any) -> dict[Part, set[str]]:
@@ -33,7 +30,10 @@ def parts(objects: Iterable[str] = OBJECTS, fold: int = 0, **config: Any) -> dic
 
 @settings(max_examples=16)
 @given(
-    st.sampled_from(NAMES), st.integers(0, 2**31 - 1), st.sets(st.sampled_from(OBJECTS), min_size=60), st.integers(0, 9)
+    st.sampled_from(["paper", "release", "kfold"]),
+    st.integers(0, 2**31 - 1),
+    st.sets(st.sampled_from(OBJECTS), min_size=60),
+    st.integers(0, 9),
 )
 def test_every_video_has_one_part_and_every_object_too(name: str, seed: int, objects: set[str], trained: int) -> None:
     """So no object is both trained on and tested under one seed."""
@@ -87,34 +87,9 @@ def test_fewer_training_objects_change_no_other_part() -> None:
         parts(fold=1, name="kfold", folds=3, train_objects=count + 1)
 
 
-@settings(max_examples=12)
-@given(st.integers(0, 2**31 - 1), st.integers(1, 30), st.sets(st.sampled_from(OBJECTS), min_size=20))
-@example(0, 7, set(OBJECTS))
-def test_development_keeps_away_from_the_test_set(seed: int, count: int, objects: set[str]) -> None:
-    """And draws from training objects that have videos, of which three remain."""
-    present = TRAIN & objects
-    if count > len(present) - 3:
-        with refused(rf"split\.test_objects is {count}, but {len(present)} training .* allow {len(present) - 3}"):
-            parts(objects, name="development", seed=seed, test_objects=count)
-        return
-    split = parts(objects, name="development", seed=seed, test_objects=count)
-    assert len(split[Part.TEST]) == count
-    assert split[Part.TEST] <= present
-    assert split[Part.TRAIN] == present - split[Part.TEST]
-    assert split[Part.UNUSED] == OF_PAPER[Part.TEST] & objects
-
-
-def test_development_is_stratified_and_seeded() -> None:
-    chosen = {frozenset(parts(name="development", seed=seed)[Part.TEST]) for seed in range(6)}
-    assert len(chosen) > 4
-    for test, place in itertools.product(chosen, range(3)):
-        whole, part = (Counter(CATALOGUE.labels(o)[place] for o in objects) for objects in (TRAIN, test))
-        for level, number in whole.items():
-            assert abs(part[level] - number / 60 * 7) < 1.5, "within one and a half objects of proportion"
-
-
 def test_missing_objects_are_reported_or_refused() -> None:
-    present = {*OBJECTS} - OF_PAPER[Part.TEST] - {"denim"}
+    tested = {o for o in OBJECTS if CATALOGUE.objects[o].splits["paper"] == Part.TEST}
+    present = {*OBJECTS} - tested - {"denim"}
     assert not parts(present, name="paper")[Part.TEST]
     with refused(r"ice_block.*denim.*split\.missing"):
         parts(present, name="paper", missing="error")
@@ -148,8 +123,7 @@ def test_a_column_is_a_split(name: str) -> None:
     ("columns", "name", "words"),
     [
         ({}, "paper", "split.name=paper is no split of the catalogue; allowed: kfold "),
-        ({}, "development", "split.name=development needs the column split_paper; allowed: kfold "),
-        ({"paper": "paper"}, "mine", "allowed: paper, development, kfold "),
+        ({"paper": "paper"}, "mine", "allowed: paper, kfold "),
     ],
 )
 def test_a_split_that_is_not_there_is_refused(columns: dict[str, str], name: str, words: str) -> None:

@@ -23,11 +23,9 @@ from pipeline.running.errors import UserError, first_problem
 from pipeline.videos.catalogue.csv_reader import Row, read_rows
 from pipeline.videos.catalogue.wording import OPENING, Language, Property, Scenario
 
-__all__ = ["RULED_SPLITS", "Catalogue", "Language", "Object", "Property", "Scenario", "load_catalogue"]
+__all__ = ["Catalogue", "Language", "Object", "Property", "Scenario", "load_catalogue"]
 
 OBJECTS, PROPERTIES, DESCRIPTIONS, TEXTS = "objects.csv", "properties.yaml", "descriptions.csv", "texts.csv"
-RULED_SPLITS = ("development", "kfold")
-"""Splits that are made by rule; no column may bear their names."""
 
 
 class Object(Record):
@@ -197,10 +195,10 @@ def _split_columns(file: Path, header: Sequence[str], language: Language) -> dic
             raise UserError(f"{file}: column {column} names no property; allowed: label_ and {', '.join(names)}")
     splits = {column: column.removeprefix("split_") for column in header if column.startswith("split_")}
     for column, name in splits.items():
-        if name in RULED_SPLITS or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+        if name == "kfold" or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
             raise UserError(
                 f"{file}: column {column}: a split's name begins with a small letter, goes on with those, digits or _, "
-                f"and is neither {' nor '.join(RULED_SPLITS)}; rename it"
+                "and is not kfold, which is made by rule; rename it"
             )
     return splits
 
