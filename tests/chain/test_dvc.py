@@ -151,31 +151,6 @@ def test_a_split_without_a_test_object_is_one_warning(tmp_path: Path, caplog: py
     assert "7 of 7 test objects have no videos (bath_towel, " in said[0]
 
 
-RUNS_ALL = {"package", "publish", "report"}
-EDITS = {
-    "pipeline/evaluation/rows.py": RUNS_ALL,
-    "pipeline/report/tables.py": {"report", "publish"},
-    "pipeline/running/progress.py": set(),
-    "pipeline/weights/backbones.py": {
-        *("weights", "pretrain", "finetune_encoder", "embed", "evaluate"),
-        "report",
-        "package",
-    },
-    "pipeline/evaluation/grading.py": {"grade", "evaluate", *RUNS_ALL},
-    "pipeline/tasks/pc.py": {"questions", "grade", "evaluate", *RUNS_ALL},
-    "pipeline/language/chat.py": {"align", "lora", "answer", "evaluate", "report", "package"},
-}
-"""A row of a report, a column of its tables, a line of progress, a backbone, a grader, a prompt and its grader, a chat
-format: and the stages that an edit makes stale. What follows these runs where their outputs come out otherwise."""
-
-
-@pytest.mark.parametrize("file", EDITS)
-def test_an_edit_makes_stale_what_it_can_change(file: str) -> None:
-    assert (ROOT / file).is_file()
-    stale = {n for n in stages() if any(file == d or file.startswith(f"{d}/") for d in code(n))}
-    assert stale == EDITS[file]
-
-
 def test_what_computes_with_floats_depends_on_the_kernels() -> None:
     assert {n for n, own in stages().items() if "kernels" not in own.get("params", [])} == {
         *("split", "questions", "grade", "publish")
@@ -209,9 +184,3 @@ def test_a_command_is_the_same_whatever_the_parameters() -> None:
     for name, own in stages().items():
         filled = set(re.findall(r"\$\{(.*?)\}", own["cmd"]))
         assert filled == {f"item.{axis}" for axis in own.get("matrix", {})}, name
-
-
-def test_what_changes_answers_is_a_parameter_of_what_answers() -> None:
-    keys = {"answer": "language.generation_batch_size", "finetune_encoder": "encoder.max_grad_norm"}
-    keys |= {"embed": "encoder.embed_batch_size"}
-    assert {name for name, key in keys.items() if key not in stages()[name]["params"]} == set()

@@ -8,7 +8,7 @@ import random
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,7 +38,6 @@ from pipeline.training.trainable import load_trainable, trainable_state
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
 from pipeline.videos.records import Assignment
-from tests.conftest import refused
 from tests.encoder.conftest import Hook, gradient, setting_of
 from tests.encoders import PARTS, config, float64, training, write_frames, write_pretrained
 
@@ -178,14 +177,6 @@ def test_evaluation_samples_are_uniform_from_the_first(count: int, k: int) -> No
     assert drawn[-1] < count
     gaps = [b - a for a, b in itertools.pairwise(drawn)]
     assert all(between in (count // k, -(-count // k)) for between in gaps)
-
-
-@pytest.mark.parametrize(("file", "reference"), [("frames.npy", "none"), ("references.npy", "subtract")])
-def test_a_row_too_few_is_an_error(tmp_path: Path, file: str, reference: Literal["none", "subtract"]) -> None:
-    write_frames(tmp_path, {"a_0": 4, "b_0": 1})
-    np.save(tmp_path / file, np.load(tmp_path / file)[:-1])
-    with refused("differ in length; run"):
-        FrameStore(tmp_path, reference)
 
 
 def test_a_clip_depends_on_seed_epoch_and_video_alone(tmp_path: Path) -> None:

@@ -44,7 +44,6 @@ from tests.language.conftest import (
 )
 
 CPU = RuntimeConfig(device="cpu")
-RUNTIME = RuntimeConfig(device="cpu", save_steps=2)
 CONFIG = LoraTrainConfig(
     **{**SMALL.model_dump(), "epochs": 2, "samples": 10}, rank=4, alpha=8, learning_rate=1e-3, dropout=0.1
 )
@@ -175,8 +174,6 @@ def test_training_goes_on_from_a_trained_model(held: Material, checkpoints: Path
     fit(model, data, SMALL, CPU, Job("align", "x", 0))
     changed = {name for name, value in model.named_parameters() if not torch.equal(before[name], value)}
     assert {name.split(".")[0] for name in changed} == {"connector"}
-    with refused("lora.rank: the adapter to train on has 4; set lora.rank=4"):
-        add_lora(model, CONFIG.model_copy(update={"rank": 8}))
     with refused(r"lora.target_modules: the adapter to train on has \[k_proj,q_proj\]; set lora.target_modules=\["):
         add_lora(model, CONFIG.model_copy(update={"target_modules": "all-linear"}))
     add_lora(model, CONFIG)
@@ -184,12 +181,6 @@ def test_training_goes_on_from_a_trained_model(held: Material, checkpoints: Path
     after = {name for name, value in model.named_parameters() if not torch.equal(before[name], value)}
     assert {name for name in before if "lora_" in name} <= after
     assert not {name for name in after if name.startswith("llm") and "lora_" not in name}
-    everywhere = CONFIG.model_copy(update={"target_modules": "all-linear"})
-    adapted(assemble(held, CONFIG, "test")[0], everywhere).save_pretrained(tmp_path / "begun" / "language")
-    model, _ = assemble(went_on, CONFIG, "lora")
-    add_lora(model, everywhere)
-    with refused("lora.target_modules: the adapter to train on has all-linear"):
-        add_lora(model, CONFIG)
     other = replace(went_on, store=write_store(tmp_path / "other", [("a_0", 0, "none")], torch.zeros(1, DIM + 1)))
     with refused(f"begun reads embeddings of {DIM}, but the encoder gives {DIM + 1}; set encoder.backbone"):
         assemble(other, CONFIG, "align")
@@ -265,8 +256,6 @@ def test_a_training_is_not_gone_on_with_by_another_version_of_the_code(
     ("name", "value", "words"),
     [
         ("ACCELERATE_MIXED_PRECISION", "bf16", "ACCELERATE_MIXED_PRECISION is bf16"),
-        ("ACCELERATE_DYNAMO_BACKEND", "INDUCTOR", "ACCELERATE_DYNAMO_BACKEND is INDUCTOR"),
-        ("ACCELERATE_USE_DEEPSPEED", "true", "ACCELERATE_USE_DEEPSPEED is true"),
         ("ACCELERATE_USE_FSDP", "true", "FSDP_VERSION is 1"),
         ("WORLD_SIZE", "3", "micro_batch_size 2 on 3 devices does not divide batch_size 4"),
     ],

@@ -28,7 +28,7 @@ from pipeline.videos.frames.reference import reference_indices
 from pipeline.videos.frames.scan import Scan, scan
 from pipeline.videos.frames.selection import kept_count
 from pipeline.videos.records import Finding, Frame, Probe
-from tests.conftest import encode, moving_square, not_utf8, refused, write_video
+from tests.conftest import encode, moving_square, refused, write_video
 from tests.frame_rules import (
     CONFIG,
     FILES,
@@ -186,12 +186,6 @@ def test_an_error_names_its_video_and_keeps_what_is_finished(place: Place) -> No
     assert not {*NAMES[:4]} & {*place.decoded()}, "what stands before it is finished, and perhaps more"
 
 
-def test_names_that_are_no_text_are_named(place: Place) -> None:
-    (place.folder / "rug_0.avi").rename(not_utf8(place.folder, "rug_?_0.avi"))
-    with refused(r"rug_\\udcff_0\.avi: its name is no text in UTF-8; rename it"):
-        place.extract()
-
-
 def test_short_videos_are_left_out_by_the_published_rule(place: Place, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         found = place.extract(FramesConfig(pixels=16, selection="release"))
@@ -203,14 +197,6 @@ def test_short_videos_are_left_out_by_the_published_rule(place: Place, caplog: p
         own = [(f.frame_index, int(f.score)) for f in found.frames if f.video_id == video.video_id]
         assert own == published(place.folder / video.path, video.frames)
     assert len(np.load(place.out / "references.npy")) == 2
-
-
-def test_nothing_to_keep_is_an_error(place: Place) -> None:
-    for name in ("potato_0", "rug_0"):
-        (place.folder / f"{name}.avi").unlink()
-    with refused(r"no video has a frame to keep; choose another frames\.selection"):
-        place.extract(FramesConfig(pixels=16, selection="release"))
-    assert not place.out.exists()
 
 
 # Hard videos: no contact, tiny pictures, lying headers, broken files

@@ -62,29 +62,20 @@ LLAMA: list[Damage] = [
     (lambda f: (f / "tokenizer.json").write_text(""), "tokenizer.json is no fast tokenizer"),
     NO_WIDTH,
     (lambda f: cut(f / ONE), "model.safetensors is cut off or not a safetensors file .*; download it"),
-    (lambda f: (f / ONE).rename(f / "pytorch_model.bin"), "only pickles"),
-    (lambda f: (f / "tokenizer.json").unlink(), "tokenizer.json does not exist"),
-    (lambda f: (f / "tokenizer_config.json").write_text("{"), "_config.json is not a JSON object"),
-    (lambda f: edit(f / "config.json", model_type=None), "cannot be loaded .*model_type"),
     (lambda f: without(f / ONE, "lm_head.weight"), "lm_head.weight is missing"),
     (other_vocabulary, "tokenizer.json has words up to number 259, but vocab_size of .*/config.json is 259"),
 ]
 SHARDS: list[Damage] = [
     (lambda f: (f / "model-00002-of-00007.safetensors").unlink(), "No such file.*model-00002-of-00007"),
-    (lambda f: cut(f / "model-00003-of-00007.safetensors"), "model-00003-of-00007.* is cut"),
     (lambda f: edit(f / INDEX, weight_map={}), "shards cannot be loaded"),
 ]
 CLIP: list[Damage] = [
     NO_NUMBER,
     (lambda f: vision(f, width=48), "does not fit its open_clip_config.json .*mismatch for class_embedding"),
-    (lambda f: vision(f, layers=[3, 4, 6, 3]), "is no vision transformer"),
-    (lambda f: (f / CLIP_FORM).write_text("{}"), "open_clip_config.json"),
 ]
 TIMM: list[Damage] = [
     (lambda f: cut(f / ONE), "^encoder.weights: timm/model.safetensors is cut off"),
-    (lambda f: (f / ONE).rename(f / "pytorch_model.bin"), "pickles are refused"),
     (lambda f: (f / "config.json").unlink(), "config.json does not exist; set encoder.weights=data/weights/"),
-    (lambda f: (f / "config.json").write_text("{}"), "is no configuration of a timm backbone"),
 ]
 
 
@@ -114,14 +105,9 @@ MAKE = "data/weights/tiny-llama/config.json does not exist; `dvc repro weights` 
     ("ask", "words"),
     [
         (lambda: check_recipe("papr"), r"^encoder.recipe: papr is no recipe; did you mean paper\? known: paper, "),
-        (lambda: check_encoder(Path(), 32, ("tim",)), r"^encoder.backbone: tim .*; did you mean timm\? known: clip, "),
         (lambda: check_encoder(MADE_DIR / "tiny-llama", 64, ("clip",)), NOT_MADE),
-        (lambda: check_language(MADE_DIR / "gpt"), "language.weights: data/weights/gpt is none .* smollm2, tiny-llama"),
-        (lambda: check_encoder(MADE_DIR / "tiny-clip", 63, ("clip",)), "set frames.pixels=64"),
         (lambda: check_encoder(write_clip(Path("c")), 24, ("clip",)), r"frames\.pixels is 24 .* frames\.pixels=32$"),
-        (lambda: check_encoder(Path("nowhere"), 8, ("timm",)), "nowhere/config.json does not exist; set encoder.weigh"),
         (lambda: load_tokenizer(MADE_DIR / "tiny-llama"), MAKE),
-        (lambda: load_llm(MADE_DIR / "tiny-llama", dtype=None), MAKE),
     ],
 )
 def test_what_is_not_there_or_not_known_is_one_line(ask: Callable[[], object], words: str) -> None:
@@ -203,22 +189,13 @@ def spoil(folder: Path, file: str, name: str) -> None:
     replace(folder / file, name, value)
 
 
-def spoil_a_shard(folder: Path) -> None:
-    spoil(folder, json.loads((folder / INDEX).read_text())["weight_map"][DOWN], DOWN)
-
-
-def pickled(folder: Path) -> None:
-    torch.save(load_file(folder / CLIP_FILE), folder / "open_clip_pytorch_model.bin")
-    (folder / CLIP_FILE).unlink()
-
-
 def disguised(file: Path) -> None:
     """A pickle under the name of a file of safetensors."""
     torch.save({"a": torch.zeros(1)}, file)
 
 
 DOWN = "model.layers.1.mlp.down_proj.weight"
-MLP, RUNNING = "transformer.resblocks.1.mlp.c_fc.bias", "blocks.0.0.bn1.running_var"
+RUNNING = "blocks.0.0.bn1.running_var"
 NAN = "holds values that are not finite; d"
 NO_FIT = r"^encoder.weights: \w+ does not fit its (open_clip_)?config.json"
 
@@ -226,16 +203,10 @@ NO_FIT = r"^encoder.weights: \w+ does not fit its (open_clip_)?config.json"
 @pytest.mark.parametrize(
     ("kind", "damage", "words"),
     [
-        ("llama", lambda f: (f / "tokenizer.json").write_text("{}"), "^language.weights: .*llama"),
-        ("shards", spoil_a_shard, rf"^language.weights: {DOWN} in shards/model-0000\d-of-00007.safetensors {NAN}"),
-        ("clip", lambda f: spoil(f, CLIP_FILE, f"visual.{MLP}"), f"{MLP} in clip/{CLIP_FILE} {NAN}"),
-        ("clip", pickled, f"^encoder.weights: clip/{CLIP_FILE} does not exist; "),
-        ("clip", lambda f: disguised(f / CLIP_FILE), NO_FIT),
-        ("clip", lambda f: vision(f, unheard_of=1), NO_FIT),
+        ("llama", lambda f: spoil(f, ONE, DOWN), f"^language.weights: {DOWN} in llama/{ONE} {NAN}"),
         ("clip", lambda f: form_of_clip(f, "text_cfg", hf_model_name="roberta"), "open_clip would ask a hub"),
         ("timm", lambda f: spoil(f, ONE, RUNNING), f"{RUNNING} in timm/{ONE} {NAN}"),
         ("timm", lambda f: disguised(f / ONE), NO_FIT),
-        ("timm", lambda f: edit(f / "config.json", architecture="test_resnet"), NO_FIT),
     ],
 )
 def test_a_broken_folder_is_one_line_at_loading_too(kind: str, damage: Callable[[Path], object], words: str) -> None:
@@ -243,8 +214,6 @@ def test_a_broken_folder_is_one_line_at_loading_too(kind: str, damage: Callable[
     damage(folder)
     with refused(words):
         if kind == "llama":
-            load_tokenizer(folder)
-        elif kind == "shards":
             load_llm(folder, torch.float32)
         else:
             base_encoder(config(folder, "tuned", backbone=(kind,)))

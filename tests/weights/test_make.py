@@ -136,17 +136,3 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert CliRunner().invoke(app, ["weights", "tiny-clip"]).exit_code == 0
     assert CliRunner().invoke(app, ["weights", "tiny-clip", "--to", "else/where"]).exit_code == 0
     assert contents(Path("weights/tiny-clip")) == contents(Path("else/where")) == contents(model_folder("tiny-clip"))
-
-
-@pytest.mark.parametrize(
-    ("text", "front"),
-    [
-        (b"---\nlicense: mit\n---\n# A model", {"license": "mit"}),
-        (b"---\nlicense: a: b\n---\n", {}),
-        (b"---\nauthor: M\xfcller\n---\n", {}),
-        (b"---\n\nA rule, and no front matter.\n", {}),
-    ],
-)
-def test_a_foreign_card_is_no_obstacle(text: bytes, front: dict[str, str], tmp_path: Path) -> None:
-    (tmp_path / "README.md").write_bytes(text)
-    assert front_matter(tmp_path) == front
