@@ -119,7 +119,6 @@ def catalogue() -> Catalogue:
 
 @pytest.fixture(scope="session")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A tiny CLIP."""
     from tests.encoders import write_tower
 
     return write_tower(tmp_path_factory.mktemp("clip"))

@@ -134,6 +134,7 @@ def test_any_folder_may_hold_the_videos(name: str, tmp_path: Path) -> None:
         ("small data.source=videos data.dir=nowhere", "data.dir: nowhere does not exist"),
         ("smoke language.weights=nowhere", "hf download lmsys"),
         ("smoke language.start=models/nothing", "language.start: models/nothing holds no trained model"),
+        ("smoke scenes.objects=[unicorn]", "scenes.objects: unicorn"),
         ("smoke frames.pixels=48", "frames.pixels"),
         ("smoke cross_validation.folds=3", "cross_validation is no section any more; .*split.name=kfold"),
     ],

@@ -36,7 +36,6 @@ def put(name: str, content: str | bytes | None) -> None:
 
 
 def with_data(**changes: str) -> None:
-    """Change the section `data` of params.yaml."""
     values = load_params(PARAMS_FILE).model_dump(mode="json")
     values["data"].update(changes)
     write_params(validate(values, str(PARAMS_FILE)), PARAMS_FILE)
@@ -51,7 +50,6 @@ def catalogued(name: str, content: str | bytes) -> None:
 
 
 def videos(name: str, content: str | bytes) -> None:
-    """A folder videos/ with a good video and this file."""
     with_data(source="videos", dir="videos")
     write_video(Path("videos/baseball_0.avi"), moving_square(8, 0))
     put(f"videos/{name}", content)

@@ -20,7 +20,6 @@ from pipeline import config
 from pipeline.core import layout
 from pipeline.core.records import Lora, Variant
 from tests.closure import ROOT, closure
-from tests.project import OBJECTS, REDUCED, copy_project
 
 TOLD = {
     *("pipeline/__init__.py", "pipeline/config/__init__.py", "pipeline/config/params.py", "pipeline/tracking"),
@@ -134,21 +133,6 @@ def test_every_listed_parameter_changes_the_stage_s_key_in_the_run_cache(tmp_pat
             section[last] = old
     assert checked == {(name, key) for name, keys in every.items() for key in keys}
     assert not silent, "the run cache would bring back the results of another value"
-
-
-def test_a_split_without_a_test_object_is_one_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """DVC warns of every empty file at every stage that depends on it, and there are eight that answer."""
-    project = copy_project(tmp_path / "untested")
-    learnt = ",".join(o for o in OBJECTS if o not in ("bath_towel", "ice_block", "toilet_brush_bristles"))
-    project.run("octopi", "scale", *REDUCED, f"scenes.objects=[{learnt}]")
-    said = [line for line in project.run("dvc", "repro", "questions").splitlines() if "WARNING" in line]
-    with Repo(str(project.folder)) as repo:
-        for stage in (stage for stage in repo.index.stages if stage.name.startswith("answer@")):
-            for dependency in (dependency for dependency in stage.deps if dependency.exists):
-                dependency.save()
-    assert [line for line in caplog.messages if "is empty" in line] == []
-    assert len(said) == 1
-    assert "7 of 7 test objects have no videos (bath_towel, " in said[0]
 
 
 def test_what_computes_with_floats_depends_on_the_kernels() -> None:

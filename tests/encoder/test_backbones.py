@@ -53,7 +53,6 @@ def timm_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def side_by_side(timm_folder: Path) -> SideBySide:
-    """The backbone `timm` alone."""
     encoder = base_encoder(config(timm_folder, "tuned", backbone=("timm",), feature_stage=2))
     assert isinstance(encoder, SideBySide)
     return encoder

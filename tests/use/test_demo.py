@@ -104,8 +104,6 @@ def test_an_answer_that_nobody_hears_ends(site: str, session: Session) -> None:
 
 
 def said(session: Session, **asked: Any) -> str:
-    """A whole answer."""
-
     async def whole() -> str:
         return "".join([piece async for piece in await session.stream(Asked(**asked))])
 

@@ -184,7 +184,6 @@ def test_presses_that_are_near_share_what_lies_between_them() -> None:
 
 
 def imported(*command: object) -> str:
-    """What `octopi import` prints, or the one line with which it refuses."""
     result = CliRunner().invoke(app, ["import", *map(str, command)])
     if result.exit_code == 0:
         return result.output

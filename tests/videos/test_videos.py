@@ -39,7 +39,6 @@ def warnings(listing: Listing) -> list[str]:
 
 
 def test_a_good_folder(tiny_videos: Path, tmp_path: Path, catalogue: Catalogue) -> None:
-    """Sorted by object, then by number."""
     folder = Path(shutil.copytree(tiny_videos, tmp_path / "v"))
     listing = list_videos(folder, catalogue)
     names = ["baseball_0", "baseball_1", "baseball_10", "potato_0", "potato_2", "rug_0", "rug_1"]

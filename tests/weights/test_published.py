@@ -111,7 +111,6 @@ def vicuna(pieces: Path) -> Path:
 
 
 def octopi(*arguments: str) -> str:
-    """What `octopi weights` prints; its UserError is raised."""
     return CliRunner().invoke(app, ["weights", *arguments], catch_exceptions=False).output
 
 
