@@ -5,11 +5,10 @@ from __future__ import annotations
 import os
 import random
 import shutil
-import socket
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -60,14 +59,6 @@ def wait_until_ended(processes: Iterable[psutil.Process]) -> None:
             while process.is_running() and process.status() != psutil.STATUS_ZOMBIE:
                 assert time.monotonic() < end, f"{process} is alive"
                 time.sleep(0.02)
-
-
-@contextmanager
-def deaf_port() -> Iterator[int]:
-    """A port of this machine that refuses connections for as long as it is held: bound, but nobody listens."""
-    with closing(socket.socket()) as held:
-        held.bind(("127.0.0.1", 0))
-        yield held.getsockname()[1]
 
 
 def not_utf8(folder: Path, name: str) -> Path:

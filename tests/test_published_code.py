@@ -21,7 +21,7 @@ from pipeline.cli import app
 from pipeline.config import EncoderConfig, FramesConfig, LanguageConfig, LoraTrainConfig
 from pipeline.core.records import Turn
 from pipeline.encoder.model import PropertyClassifier
-from pipeline.encoder.release import property_classifier, sinusoid
+from pipeline.encoder.release import property_classifier
 from pipeline.language.chat import IGNORE_INDEX, PIECE, TACTILE, encode, render
 from pipeline.language.generate import reply, write_prompt
 from pipeline.language.lora import add_lora
@@ -112,13 +112,6 @@ def test_features_and_heads(classifier: PropertyClassifier) -> None:
         logits = classifier(frames[None], places[None])["logits"][0].split(3)
         for name, found in zip(PROPERTIES, logits, strict=True):
             close(found, own[name])
-
-
-def test_sinusoid() -> None:
-    """Theirs is computed in float32, and off by up to 1e-5 at late frames."""
-    known = numbers("sinusoid_1024")
-    places, theirs = (known[key] for key in sorted(known, key=lambda key: known[key].ndim))
-    close(sinusoid(places.flatten(), theirs.shape[-1]), theirs.reshape(-1, theirs.shape[-1]), 2e-5)
 
 
 def test_one_step_of_the_encoder(octopi: Octopi, monkeypatch: pytest.MonkeyPatch) -> None:

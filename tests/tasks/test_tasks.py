@@ -173,7 +173,6 @@ UNREAD = {
         The first object is harder.
         Yesterday
         Yes. Conclusion: I cannot say.
-        First object: Overall, yes.
         Yes and no.
         Conclusion: No / yes
         **Yes** / **No**
@@ -186,7 +185,6 @@ UNREAD = {
     "PSS": """
         d) is the hardest.
         a) is the hardest. b) is the hardest.
-        ba) is the
         a) is the same as b).
         The hardest is **a)** or **b)**.
         Answer: A human cannot tell.
@@ -199,22 +197,17 @@ UNREAD = {
         None of **b)**
         """,
     "RIPE": """
-        a) It is soft
         The riper avocado is a) or b).
         The riper avocado is a). No: the riper avocado is b).
         The less ripe avocado is a).
-        The riper avocado is c).
         The riper kiwi is a).
         """,
     "PSR": """
         The most suitable object is a) or b).
-        The most suitable object is x), because xxx
         The most suitable object is a). The most suitable object is b).
-        a) and b)
         The object is a).
         Neither a) nor b) is the most suitable.
         I do not think that b) is the most suitable.
-        Answer: c
         The most suitable object is a
         The most suitable object for a pan. What is b)?
         """,
@@ -226,7 +219,6 @@ READ = {
         The answer is **yes**.
         In conclusion, yes.
         “Yes”, it is.
-        1. Yes.
         $\\boxed{\\text{Yes, the first}}$
         Conclusion: No. Conclusion: Yes, the first object is harder.
         """,
@@ -250,18 +242,14 @@ READ = {
     ("PSR", "b"): """
         The most suitable object is (b), because a) is soft.
         The most suitable object for cleaning a pan without scratching it is b).
-        the most suitable object is B)
         b) is the best choice.
-        \\boxed{\\text{b)}}
         Option B
         The most suitable object is: b)
-        So, b) is the most suitable object.
         the most suitable object is Object b
         """,
     ("RIPE", "b"): """
         The riper avocado is **b)**.
         Thus b) is riper.
-        \\boxed{B}
         The Riper Avocado is (B).
         a) is hard, so the riper one is b).
         """,
