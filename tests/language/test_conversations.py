@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,13 +16,27 @@ from hypothesis import strategies as st
 from torch.utils.data import BatchSampler
 
 from pipeline.core.io import read_table, save_tensors
-from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Embedding
+from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Embedding, Turn
 from pipeline.core.runtime import derive_seed
 from pipeline.language.conversations import FILLER, UpdateSampler
+from pipeline.language.generate import write_prompt
 from pipeline.language.training import Material, assemble
 from pipeline.training.embeddings import EmbeddingStore
 from tests.conftest import refused
-from tests.language.conftest import taking
+from tests.language.conftest import FRAMES, generation, taking
+
+
+def test_without_a_begin_token_all_else_is_the_same(held: Material) -> None:
+    (_, ours), (model, theirs) = (
+        assemble(replace(held, language=held.language.model_copy(update={"bos": bos})), taking(6), "test")
+        for bos in (True, False)
+    )
+    for own, other in zip(ours.written, theirs.written, strict=True):
+        assert own["input_ids"][0] == 1
+        assert all(torch.equal(own[name][1:], value) for name, value in other.items())
+    turns = [Turn(user="Feel {tactile}.", assistant="Soft.")]
+    without = write_prompt(turns, model.tokenizer, generation(1).model_copy(update={"bos": False}), FRAMES)
+    assert write_prompt(turns, model.tokenizer, generation(1), FRAMES) == (1, *without)
 
 
 @settings(max_examples=30)

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
+from pipeline.scenes import contact
 from pipeline.scenes.contact import FORCES, Method, choose, press, press_by, slope_error
 from pipeline.scenes.elastic.kernels import Gel
 from pipeline.scenes.elastic.winkler import hang_skin, press_springs, series
@@ -76,6 +77,13 @@ def test_auto_spends_more_on_a_tighter_tolerance_and_less_on_a_plain_body() -> N
     method, error, _ = choose(BODIES["flat"], 0.5, 0.05, PITCH, 0.2)
     assert method == Method("winkler")
     assert error < 0.2
+
+
+def test_where_one_grid_alone_is_fine_enough_it_is_held_against_all_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(contact, "LADDER", (Method("layer", 32),))
+    method, error, _ = choose(BUMPY, 8.0, 5.0, PITCH, 1e-6)
+    assert method == FINEST
+    assert error > 0, "an estimate, and not the nothing that it was held against"
 
 
 @pytest.mark.parametrize("method", [Method("winkler"), Method("layer", 32), Method("half_space", 64)], ids=str)

@@ -234,6 +234,20 @@ def test_fitted_frames_are_near_a_bicubic_resize(tmp_path: Path, height: int, wi
             assert np.quantile(error, 0.99) <= 16, (pixels, mode)
 
 
+@pytest.mark.parametrize("pixels", ["yuv420p", "yuv444p", "yuv410p", "yuv411p"])
+@pytest.mark.parametrize("mode", ["crop", "squash"])
+def test_one_colour_fills_every_square(pixels: str, mode: str) -> None:
+    expected = np.array([1.164 * 84 + 1.596 * 72, 1.164 * 84 + 0.392 * 38 - 0.813 * 72, 1.164 * 84 - 2.017 * 38])
+    for height, width in ((36, 48), (17, 97), (240, 321), (1, 9), (1, 1), (2, 2), (3, 200)):
+        frame = av.VideoFrame(width, height, pixels)
+        for plane, value in zip(frame.planes, (100, 90, 200), strict=True):
+            plane.update(bytes([value]) * plane.buffer_size)
+        for size in (16, 64):
+            image = fit(frame, FramesConfig(pixels=size, fit=mode))
+            assert (image.shape, image.dtype) == ((size, size, 3), np.uint8)
+            assert np.abs(image - expected).max() <= 1
+
+
 @pytest.mark.parametrize(("count", "fps", "size"), [(2, 25.0, (48, 64)), (30, 10.0, (48, 64)), (13, 12.5, (47, 65))])
 def test_what_is_written_is_read(tmp_path: Path, count: int, fps: float, size: tuple[int, int]) -> None:
     """Files as the real videos are coded: MPEG-4 part 2, a whole picture every twelve; sides may be odd."""
