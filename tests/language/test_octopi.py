@@ -164,10 +164,5 @@ def test_a_broken_model_is_one_line(
 
 def test_another_base_is_refused(model: OctopiForCausalLM, tmp_path: Path) -> None:
     trained(model).save_pretrained(tmp_path / "saved")
-    for shape, size, words in (
-        ("hidden_size", 64, "made for word embeddings of 32, but .*hidden_size has 64"),
-        ("num_key_value_heads", 4, "adapter is broken or of another language model .*size mismatch"),
-    ):
-        base = write_llama(tmp_path / shape, **{shape: size})
-        with refused(words):
-            OctopiForCausalLM.from_pretrained(tmp_path / "saved", base=base)
+    with refused("made for word embeddings of 32, but .*base has 64"):
+        OctopiForCausalLM.from_pretrained(tmp_path / "saved", base=write_llama(tmp_path / "base", hidden_size=64))
