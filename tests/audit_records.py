@@ -87,7 +87,6 @@ def relabelled(catalogue: Catalogue, **changes: object) -> Catalogue:
 
 
 def recorded(object_id: str, seed: int, sensor: int = 0) -> list[np.ndarray]:
-    """A synthetic press of an object."""
     look = make_sensor(SCENE.width, SCENE.height, sensor)
     scene = make_scene(recipe_of(object_id, PHYSICLEAR, 0), SCENE, int(SCENE.frames), seed)
     return list(render(scene, SCENE, look, seed))

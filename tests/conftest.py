@@ -5,11 +5,10 @@ from __future__ import annotations
 import os
 import random
 import shutil
-import socket
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -62,14 +61,6 @@ def wait_until_ended(processes: Iterable[psutil.Process]) -> None:
                 time.sleep(0.02)
 
 
-@contextmanager
-def deaf_port() -> Iterator[int]:
-    """A port of this machine that refuses connections for as long as it is held: bound, but nobody listens."""
-    with closing(socket.socket()) as held:
-        held.bind(("127.0.0.1", 0))
-        yield held.getsockname()[1]
-
-
 def not_utf8(folder: Path, name: str) -> Path:
     """A place with a byte that begins no character; skips where the file system takes none."""
     path = folder / name.replace("?", "\udcff")
@@ -119,7 +110,6 @@ def catalogue() -> Catalogue:
 
 @pytest.fixture(scope="session")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A tiny CLIP."""
     from tests.encoders import write_tower
 
     return write_tower(tmp_path_factory.mktemp("clip"))

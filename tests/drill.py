@@ -90,7 +90,6 @@ class Drill:
             )
 
     def run(self) -> tuple[int, str]:
-        """Run the chain as a person does; return status and output."""
         log = self.folder.with_name("run.txt")
         return self.start(log).wait(LONGEST), log.read_text()
 
@@ -112,7 +111,6 @@ class Drill:
         leader = self.start(log, DRILL_STRIKE=json.dumps([event, pattern] if event else None))
 
         def running() -> list[psutil.Process]:
-            """The stage's process, once there is one."""
             return alive(leader.pid, f"stages/{stage.partition('@')[0]}.py")[:1]
 
         output, whom = "", rng.choice(("stage", "stage", "dvc", "group"))

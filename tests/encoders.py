@@ -111,7 +111,6 @@ def close(found: torch.Tensor, expected: Floats, rtol: float = 1e-5) -> None:
 
 
 def random_heads(seed: int, dim: int, classes: Sequence[int], strength: float) -> FittedHeads:
-    """FittedHeads that nobody fitted."""
     rng = np.random.default_rng(seed)
     return FittedHeads(
         centre=rng.normal(size=dim).astype(np.float32),

@@ -54,27 +54,15 @@ def test_committed_params_are_written_as_they_are(tmp_path: Path) -> None:
     ("overrides", "words"),
     [
         (["nothing=1"], "nothing.*allowed here"),
-        (["frames.size=64"], "frames.size is called frames.pixels now"),
         (["frames.per_video=0"], "frames.per_video.*greater than or equal to 1"),
         (["split.fold=1"], "split.fold is not a parameter.*folds"),
         (["split.name=kfold", "split.folds=3", "ablation.seeds=[0,1,3]"], r"ablation.seeds \[0, 1, 3\].*3 folds"),
-        (["ablation.seeds=[1,1]"], "ablation.seeds.*repeats"),
         (["ablation.opd=[none]"], "ablation.opd.*lacks the full system's value all"),
-        (["split.train_objects=5"], "split.train_objects.*split.name=kfold"),
-        (["lora.skip_contradicted=true"], "lora.skip_contradicted.*encoder.embedding=logits"),
         (
             ["lora.skip_contradicted=true", "encoder={embedding:logits,standardize:true}", "questions.two_turns=0.5"],
             "lora.skip_contradicted.*questions.two_turns=0",
         ),
-        (["ablation.lora=[perhaps]"], "ablation.lora.*'with' or 'without'"),
-        (["lora.alpha=1e309"], "lora.alpha.*finite"),
         (["encoder.epochs=true"], "encoder.epochs is True: .*valid integer"),
-        (["a b=[1"], "a b"),
-        (["encoder.backbone=[timm,timm]"], "names one twice"),
-        (
-            ["encoder.recipe=tuned", "encoder.backbone=[scenes]", "encoder.reference=none"],
-            "set encoder.reference=subtract",
-        ),
         (["encoder.backbone=[timm]", "encoder.recipe=paper"], "encoder.recipe=paper is for CLIP alone"),
     ],
 )
@@ -144,10 +132,6 @@ def test_any_folder_may_hold_the_videos(name: str, tmp_path: Path) -> None:
     ("arguments", "words"),
     [
         ("small data.source=videos data.dir=nowhere", "data.dir: nowhere does not exist"),
-        ("smoke runtime.launcher=acelerate", "runtime.launcher.*acelerate"),
-        ("smoke questions.train={opd:true}", "questions.train.opd is True: .*valid integer"),
-        ("smoke ablation.seeds=[true]", "ablation.seeds.0 is True: .*valid integer"),
-        ("smoke encoder.weights=nowhere", "hf download timm"),
         ("smoke language.weights=nowhere", "hf download lmsys"),
         ("smoke language.start=models/nothing", "language.start: models/nothing holds no trained model"),
         ("smoke scenes.objects=[unicorn]", "scenes.objects: unicorn"),
@@ -237,12 +221,11 @@ def test_prune_keeps_what_params_name_and_removes_the_rest(tmp_path: Path) -> No
     [
         ("defaults: [small, _self_]\n", "it calls itself small, and would replace its reports; write scale: mine"),
         ("scale: mine\nscale: other\n", "scale mine: "),
-        ("scale: größer\n".encode("latin-1"), "scale mine: "),
     ],
 )
-def test_a_scale_of_ones_own_is_checked(text: str | bytes, words: str, tmp_path: Path) -> None:
+def test_a_scale_of_ones_own_is_checked(text: str, words: str, tmp_path: Path) -> None:
     conf = Path(shutil.copytree(CONF, tmp_path / "conf"))
-    (conf / "mine.yaml").write_bytes(text if isinstance(text, bytes) else text.encode())
+    (conf / "mine.yaml").write_text(text)
     with refused(words):
         compose("mine", conf=conf)
 
@@ -257,8 +240,6 @@ def test_a_recipe_brings_its_settings_and_gives_way_to_yours() -> None:
         settings = ("all", 0.0) if recipe == "release" else ("new", 1.0)
         assert (composed.align.train_embeddings, composed.lora.max_grad_norm) == settings
         assert composed.encoder.backbone == ("clip",)
-    clip = "encoder.backbone=[clip]"
-    release = compose("small", ["encoder.recipe=release", clip], conf=CONF).encoder
-    assert (release.epochs, release.batch_size, release.weight_decay) == (40, 4, 0.01)
-    own = compose("small", ["encoder.recipe=release", clip, "encoder.epochs=3"], conf=CONF).encoder
+    yours = ["encoder.recipe=release", "encoder.backbone=[clip]", "encoder.epochs=3"]
+    own = compose("small", yours, conf=CONF).encoder
     assert (own.epochs, own.batch_size) == (3, 4)

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks import __main__ as command
-from benchmarks.figures import FOLDER, draw
+from benchmarks.figures import FOLDER
 from benchmarks.table import CSV, Error, Row, front, make_rows, mean_of, merge, read_rows, share_of
 from pipeline.evaluation.rows import ScoreRow
 from tests.conftest import refused
@@ -49,15 +49,6 @@ def rows(question: str, *points: tuple[str, float, float | None]) -> list[Row]:
     )
 
 
-def test_rows_carry_ratio_front_and_counts() -> None:
-    found = rows("q", ("a", 2, 0.3), ("b", 4, 0.2), ("c", 8, 0.25), ("d", 1, None))
-    assert [r.cost_ratio for r in found] == [1, 2, 4, 0.5]
-    assert [r.front for r in found] == [True, True, False, None]
-    assert (found[0].frames, found[1].frames, found[0].n) == (5, None, 9)
-    with pytest.raises(KeyError):
-        make_rows("q", {"a": [1.0]}, unit="ms", baseline="b")
-
-
 def test_merging_keeps_other_questions_and_their_order(tmp_path: Path) -> None:
     table = tmp_path / "speed_error.csv"
     kept, old = rows("kept", ("a", 1, 0.1), ("b", 3, 0.12345)), rows("old", ("a", 1, 0.5), ("gone", 2, 0.4))
@@ -71,16 +62,6 @@ def test_merging_keeps_other_questions_and_their_order(tmp_path: Path) -> None:
     table.write_text("question,setting\nq,s\n")
     with refused("not a table"):
         read_rows(table)
-
-
-def test_a_figure_a_question_and_stale_ones_go(tmp_path: Path) -> None:
-    (tmp_path / FOLDER).mkdir()
-    (tmp_path / FOLDER / "stale.png").write_bytes(b"")
-    table = [*rows("Which, where?", ("a, 1", 2, 0.3), ("b", 4, 0.0)), *rows("no error", ("a", 1, None), ("b", 9, None))]
-    drawn = draw(table, tmp_path)
-    assert [p.name for p in drawn] == ["which-where.png", "no-error.png"]
-    assert sorted(p.name for p in (tmp_path / FOLDER).iterdir()) == sorted(p.name for p in drawn)
-    assert all(p.read_bytes().startswith(b"\x89PNG") for p in drawn)
 
 
 def test_errors_have_intervals_over_objects() -> None:

@@ -14,7 +14,7 @@ import yaml
 from safetensors.numpy import load_file
 
 from pipeline.core.io import read_jsonl, read_table
-from pipeline.core.records import Opd, Part, Question
+from pipeline.core.records import Part, Question
 from pipeline.report.build import write_report
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool
@@ -102,18 +102,6 @@ def test_every_task_asks_about_it_and_reads_its_own_answers(pool: Pool, task: st
             assert "_" not in said, "a name is spoken in words"
             outputs = [turn.assistant for turn in dialogue.turns]
             assert all(s.correct for s in grade(question, *outputs, catalogue=pool.catalogue)), outputs
-
-
-def test_a_described_fourth_property_is_graded(pool: Pool) -> None:
-    question = next(q for q in drafted("OPD", pool, 1) if q.gold.labels[0][3] == 2)
-    (turn,) = question.dialogue(Opd.ALL).turns
-    for said, right in (("slightly sticky", False), ("sticky", True), ("", False)):
-        text = turn.assistant.replace("is sticky.", f"is {said}.")
-        scores = {s.measure: s for s in grade(question, text, catalogue=pool.catalogue)}
-        assert list(scores) == ["hardness", "roughness", "bumpiness", "surface_tack", "combined"]
-        assert scores["surface_tack"].predicted == said
-        assert [scores[m].correct for m in ("hardness", "surface_tack", "combined")] == [True, right, right]
-    assert TASKS["OPD"].chance(pool.catalogue)["combined"] == pytest.approx(1 / 108)
 
 
 @pytest.fixture(scope="module")

@@ -31,7 +31,6 @@ from pipeline.videos.frames.store import FrameStore
 from pipeline.weights.backbones import BACKBONES, Backbone, backbone_files, check_encoder
 from pipeline.weights.check import check_encoder_files
 from tests.closure import ROOT
-from tests.conftest import refused
 from tests.encoders import close, config, float64, training, write_frames, write_pretrained, write_timm
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
@@ -54,7 +53,6 @@ def timm_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def side_by_side(timm_folder: Path) -> SideBySide:
-    """The backbone `timm` alone."""
     encoder = base_encoder(config(timm_folder, "tuned", backbone=("timm",), feature_stage=2))
     assert isinstance(encoder, SideBySide)
     return encoder
@@ -247,14 +245,6 @@ def test_what_is_tuned_embeds_alike_from_its_file(timm_folder: Path, data: Encod
         torch.testing.assert_close(found, expected[rows])
 
 
-def test_a_stage_that_cannot_be_read_is_one_line(timm_folder: Path, tmp_path: Path) -> None:
-    with refused("feature_stage is 9, but the network in .* has stages 0 to"):
-        loaded(timm_folder, 9)
-    windows = {"depths": (1, 1, 1, 1), "embed_dim": 24, "num_heads": (1, 1, 1, 1)}
-    with refused("neither a CNN nor a plain vision transformer"):
-        loaded(write_timm(tmp_path / "windows", "swin_s3_tiny_224", **windows), 2)
-
-
 @pytest.mark.slow
 def test_the_documented_backbone_works(data: EncoderData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As it stands in docs/encoders.md, module and entry: it embeds, and trains beside another."""
@@ -280,11 +270,6 @@ def test_the_documented_backbone_works(data: EncoderData, tmp_path: Path, monkey
     learnt = [name for name, p in property_classifier(own, CLASSES).named_parameters() if p.requires_grad]
     assert any(".layer.1." in name for name in learnt)
     assert not any(".layer.0." in name for name in learnt)
-    with refused(r"nothing.config.json does not exist; name the folder that has it"):
-        check_encoder(tmp_path / "nothing", 28, ("dino",))
-    with refused("tiny-clip is none that is made here; name a folder of a dino"):
-        check_encoder(Path("data/weights/tiny-clip"), 28, ("dino",))
-
     write_pretrained()
     both = config(weights, "tuned", backbone=("dino", "scenes"), epochs=1)
     assert backbone_files(both) == [weights / "config.json", weights / "model.safetensors", PRETRAINED]

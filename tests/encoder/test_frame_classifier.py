@@ -24,7 +24,6 @@ from pipeline.encoder.frame_classifier import STRENGTHS, JointFrameClassifier, c
 from pipeline.encoder.model import FrameEncoder
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
-from tests.conftest import refused
 from tests.encoders import OBJECTS, Floats, config, encoder_data, float64, random_heads, training, write_pretrained
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
@@ -207,11 +206,6 @@ def test_joint_decoding_against_brute_force(seed: int, classes: list[int]) -> No
             return float(dependence[combination]) + sum(map(math.log, chances))
 
         assert tuple(decoded[video]) == max(itertools.product(*map(range, classes)), key=score)
-
-
-def test_too_many_combinations_are_one_line() -> None:
-    with refused("^1000000 combinations of classes are too many to decide"):
-        frame_classifier.log_dependence(np.zeros((1, 2), np.int64), ["a"], (1000, 1000))
 
 
 @given(st.lists(st.integers(0, 30), min_size=2, max_size=80), st.integers(2, 7), st.integers(0, 99))

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import random
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.linear_model import LogisticRegression
@@ -27,7 +25,7 @@ from pipeline.core.runtime import derive_seed, seed_everything
 from pipeline.encoder import finetune as module
 from pipeline.encoder.data import ClipDataset, EncoderData, LabelledVideo
 from pipeline.encoder.embed import logits_of, standardize, statistics, union
-from pipeline.encoder.finetune import accuracies, finetune, train_classifier, write_encoder_card
+from pipeline.encoder.finetune import accuracies, finetune, train_classifier
 from pipeline.encoder.frame_classifier import STRENGTHS, deal
 from pipeline.encoder.model import Heads, PropertyClassifier
 from pipeline.encoder.recipes import property_classifier
@@ -38,7 +36,6 @@ from pipeline.training.trainable import load_trainable, trainable_state
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
 from pipeline.videos.records import Assignment
-from tests.conftest import refused
 from tests.encoder.conftest import Hook, gradient, setting_of
 from tests.encoders import PARTS, config, float64, training, write_frames, write_pretrained
 
@@ -180,14 +177,6 @@ def test_evaluation_samples_are_uniform_from_the_first(count: int, k: int) -> No
     assert all(between in (count // k, -(-count // k)) for between in gaps)
 
 
-@pytest.mark.parametrize(("file", "reference"), [("frames.npy", "none"), ("references.npy", "subtract")])
-def test_a_row_too_few_is_an_error(tmp_path: Path, file: str, reference: Literal["none", "subtract"]) -> None:
-    write_frames(tmp_path, {"a_0": 4, "b_0": 1})
-    np.save(tmp_path / file, np.load(tmp_path / file)[:-1])
-    with refused("differ in length; run"):
-        FrameStore(tmp_path, reference)
-
-
 def test_a_clip_depends_on_seed_epoch_and_video_alone(tmp_path: Path) -> None:
     store = FrameStore(write_frames(tmp_path, {"a_0": 9, "b_0": 9}))
     videos = [LabelledVideo("a_0", (0,)), LabelledVideo("b_0", (1,))]
@@ -209,16 +198,6 @@ def test_validation_counts_videos_that_are_right_in_everything(catalogue: Catalo
     found = accuracies(logits, np.array([[0, 1, 2], [1, 0, 1], [1, 2, 1]]), decide, catalogue)
     expected = {"hardness": 2 / 3, "roughness": 1, "bumpiness": 2 / 3, "combined": 1 / 3}
     assert found == pytest.approx({f"validation_{name}": value for name, value in expected.items()})
-
-
-def test_the_card_names_weights_by_hash_data_and_settings(weights: Path, data: EncoderData, tmp_path: Path) -> None:
-    (published := tmp_path / "clip-vit-large-patch14").symlink_to(weights)
-    write_encoder_card(tmp_path / "a", data, config(published, "paper"), 3, "scenes")
-    text = (tmp_path / "a" / "README.md").read_text()
-    assert yaml.safe_load(text.split("---\n")[1])["base_model"] == ["timm/vit_large_patch14_clip_224.openai"]
-    digest = hashlib.sha256((weights / "open_clip_model.safetensors").read_bytes()).hexdigest()
-    lines = [digest, "| learning_rate | 0.001 |", "| seed | 3 |", "| training videos (scenes) | 5 |", "hardness"]
-    assert all(line in text for line in lines)
 
 
 def test_running_statistics_are_saved_with_what_is_trained_alone(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -112,24 +112,6 @@ def in_order(history: list[Measurement]) -> list[tuple[int, str, float]]:
     return sorted((m.step, m.name, m.value) for m in history)
 
 
-def updates_of_killed(
-    run: Callable[[], tuple[list[Measurement], State]], kills: Sequence[int], left: Sequence[int], before_updates: Hook
-) -> int:
-    """Updates that a run begins which is killed at some, leaving these checkpoints, and ends as one that is not."""
-    history, state = run()
-    shutil.rmtree("checkpoints")
-    begun: list[int] = []
-    before_updates(killed_at(kills, begun))
-    for number in left:
-        with pytest.raises(KeyboardInterrupt):
-            run()
-        assert f"checkpoint-{number}" in {f.name for f in Path("checkpoints").glob("*/*/*")}
-    resumed, end = run()
-    assert in_order(resumed) == in_order(history)
-    same(state, end)
-    return len(begun)
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("few_fits")
 @pytest.mark.parametrize(("kind", "validated"), [("paper", False), ("release", True), ("tuned", True)])
@@ -143,8 +125,18 @@ def test_a_killed_training_ends_as_if_it_had_not_been(
     data = encoder_data(tmp_path, catalogue, PARTS if validated else dict.fromkeys(PARTS, Part.TRAIN))
     run = partial(trained, kind, weights, data, epochs=3, batch_size=2)
     epoch = 3 if validated else 4
-    begun = updates_of_killed(run, [epoch + 1, 2 * epoch + 2], [epoch, 2 * epoch], before_updates)
-    assert begun == (epoch + 2) + (epoch + 1) + epoch, "only what the last checkpoint lacked was done again"
+    history, state = run()
+    shutil.rmtree("checkpoints")
+    begun: list[int] = []
+    before_updates(killed_at([epoch + 1, 2 * epoch + 2], begun))
+    for left in (epoch, 2 * epoch):
+        with pytest.raises(KeyboardInterrupt):
+            run()
+        assert f"checkpoint-{left}" in {f.name for f in Path("checkpoints").glob("*/*/*")}
+    resumed, end = run()
+    assert in_order(resumed) == in_order(history)
+    same(state, end)
+    assert len(begun) == (epoch + 2) + (epoch + 1) + epoch, "only what the last checkpoint lacked was done again"
     assert not any(tmp_path.glob("checkpoints/*/*"))
 
 

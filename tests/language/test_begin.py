@@ -54,14 +54,3 @@ def test_frames_read_like_the_words_of_their_classes(
     scale = means.square().mean(1).sqrt().mean() if normalize else 1.0
     read = F.normalize(projected * scale - means.mean(0), dim=1) @ F.normalize(means - means.mean(0), dim=1).T
     assert (read.argmax(1) == expected).sum() >= 90
-
-
-def test_the_start_follows_from_the_seed(held: Material, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.language.begin.STEPS", 5)
-    begun = []
-    for seed in (1, 1, 2):
-        model, data = assemble(held, taking(14), "test")
-        begin_with_words(model, data, CATALOGUE, seed)
-        begun.append(model.connector.projection[0].weight)
-    assert torch.equal(begun[0], begun[1])
-    assert not torch.equal(begun[1], begun[2])

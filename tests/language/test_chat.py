@@ -204,7 +204,6 @@ REFUSED = {
     "{{ messages | length }}{% for m in messages %}{{ m.content }}</s>{% endfor %}": "writes a prompt otherwise once",
     "{% for m in messages %}{{ m.content }}\n{% endfor %}": "ends an answer with none of </s>; the model could not",
     "{{ raise_exception('no\nsystem') }}": r"fails \(no system\); .*empty language.system_prompt",
-    "{% if %}": r"fails \(.*\); ",
 }
 
 

@@ -76,18 +76,3 @@ def test_a_question_longer_than_the_positions_is_named_with_the_key(
     setting = LanguageConfig(weights=str(write_llama(tmp_path, max_position_embeddings=60)))
     with refused(r"^[A-Z]+-train-\d+: takes \d+ tokens, .* 60 at once; lower frames.per_video"):
         assemble(material(setting, questions, store), taking(4), "test")
-    model = OctopiForCausalLM.from_base(setting.weights, DIM)
-    with refused(r"^[A-Z]+-train-\d+: .*language.system_prompt.*language.weights$"):
-        answer(model, store, questions, Opd.ALL, generation(2), FRAMES)
-
-
-def test_embeddings_of_another_length_or_of_no_such_video_are_refused(
-    language: LanguageConfig, model: OctopiForCausalLM, questions: list[Question], store: EmbeddingStore
-) -> None:
-    other = OctopiForCausalLM.from_base(language.weights, DIM + 1)
-    with refused(f"embeddings of {DIM}, but the model reads {DIM + 1}"):
-        answer(other, store, [], Opd.ALL, generation(1), FRAMES)
-    question = questions[0].model_copy(update={"videos": ("nowhere_3",) * len(questions[0].videos)})
-    _, data = assemble(material(language, [question], store), taking(1), "test")
-    with refused("nowhere_3 has no embedding; run `dvc repro`"):
-        data[0]

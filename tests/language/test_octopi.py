@@ -14,7 +14,7 @@ from transformers import AutoModelForCausalLM
 
 from pipeline.config import LanguageConfig
 from pipeline.core.records import Question
-from pipeline.language.base import load_llm, load_tokenizer
+from pipeline.language.base import load_tokenizer
 from pipeline.language.chat import IGNORE_INDEX
 from pipeline.language.conversations import collate
 from pipeline.language.lora import add_lora
@@ -113,14 +113,10 @@ def test_without_unknown_token_the_end_pads(tmp_path: Path) -> None:
         load_tokenizer(folder)
 
 
-def test_a_token_without_an_embedding_and_a_checkpoint_of_another_model_are_named(tmp_path: Path) -> None:
+def test_a_token_without_an_embedding_is_named(tmp_path: Path) -> None:
     folder = write_llama(tmp_path, vocab_size=255)
     with refused("the tokenizer .* has .*, of which the model has no embedding"):
         OctopiForCausalLM.from_base(folder, DIM)
-    deeper = write_llama(tmp_path / "other")
-    edit(deeper / "config.json", num_hidden_layers=3)
-    with refused("does not fit its config.json"):
-        load_llm(deeper, torch.float32)
 
 
 def test_rows_that_no_token_has_are_no_matter(tmp_path: Path) -> None:
@@ -133,12 +129,6 @@ def test_rows_that_no_token_has_are_no_matter(tmp_path: Path) -> None:
     assert torch.equal(model.embed(**call(model)), before)
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="here four bits may well be had")
-def test_four_bits_without_a_card_are_one_line(language: LanguageConfig) -> None:
-    with refused("^language.quantization: nf4 needs .*CUDA device.*quantization=none$"):
-        OctopiForCausalLM.from_base(language.weights, DIM, quantization="nf4")
-
-
 def pickled(file: Path) -> None:
     file.unlink()
     torch.save({}, file.with_suffix(".bin"))
@@ -149,23 +139,15 @@ def without_first(file: Path) -> None:
     save_file(dict(rest), file, {"format": "pt"})
 
 
-def foreign(file: Path) -> None:
-    save_file({name: torch.zeros(1) for name in load_file(file)}, file)
-
-
 def not_finite(file: Path) -> None:
     name, value = max(load_file(file).items())
     replace(file, name, torch.full_like(value, float("nan")))
 
 
 BROKEN: list[tuple[str, Callable[[Path], object], str]] = [
-    ("config.json", lambda file: file.write_text('{"model_type": "llama"}'), "base_model: Field required"),
     (ADAPTER, pickled, r"adapter_model.safetensors: no such file \(pickled adapters are refused\)"),
     (ADAPTER, without_first, "its adapter is broken or of another language model .*layers.0.self_attn.k_proj"),
-    (CONNECTOR, lambda file: torch.save({}, file), "not a safetensors file"),
-    (CONNECTOR, foreign, "does not fit the model"),
     (CONNECTOR, not_finite, "connector.* is not finite"),
-    (WORDS, not_finite, "words.weight is not finite; lower the learning rate"),
 ]
 
 
@@ -182,10 +164,5 @@ def test_a_broken_model_is_one_line(
 
 def test_another_base_is_refused(model: OctopiForCausalLM, tmp_path: Path) -> None:
     trained(model).save_pretrained(tmp_path / "saved")
-    for shape, size, words in (
-        ("hidden_size", 64, "made for word embeddings of 32, but .*hidden_size has 64"),
-        ("num_key_value_heads", 4, "adapter is broken or of another language model .*size mismatch"),
-    ):
-        base = write_llama(tmp_path / shape, **{shape: size})
-        with refused(words):
-            OctopiForCausalLM.from_pretrained(tmp_path / "saved", base=base)
+    with refused("made for word embeddings of 32, but .*base has 64"):
+        OctopiForCausalLM.from_pretrained(tmp_path / "saved", base=write_llama(tmp_path / "base", hidden_size=64))

@@ -9,14 +9,13 @@ import os
 import shutil
 import signal
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from safetensors.torch import load_file
 from torch.optim.optimizer import Optimizer, register_optimizer_step_pre_hook
-from transformers import TrainerCallback, TrainerState
 
 from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig
 from pipeline.core.io import read_jsonl, write_jsonl
@@ -44,31 +43,18 @@ from tests.language.conftest import (
 )
 
 CPU = RuntimeConfig(device="cpu")
-RUNTIME = RuntimeConfig(device="cpu", save_steps=2)
 CONFIG = LoraTrainConfig(
     **{**SMALL.model_dump(), "epochs": 2, "samples": 10}, rank=4, alpha=8, learning_rate=1e-3, dropout=0.1
 )
 """Three updates an epoch, the last of them smaller; six in all."""
 
 
-@dataclass
-class AtStep(TrainerCallback):
-    """Does something when a step is logged."""
-
-    step: int
-    act: Callable[[], object]
-
-    def on_log(self, args: object, state: TrainerState, *_: object, **__: object) -> None:
-        if state.global_step == self.step:
-            self.act()
-
-
-def run(kind: str, held: Material, folder: Path, *callbacks: TrainerCallback) -> Trained:
+def run(kind: str, held: Material, folder: Path) -> Trained:
     # Sums depend on the number of threads in their last bits, and each process would take its own.
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        return train(Job(kind, "x", 0, callbacks), held, CONFIG, folder)
+        return train(Job(kind, "x", 0), held, CONFIG, folder)
     finally:
         torch.set_num_threads(threads)
 
@@ -110,7 +96,9 @@ def test_killed_and_resumed_ends_the_same(kind: str, when: str, left: int, held:
     assert again.history == whole.history
     assert again.state.keys() == whole.state.keys()
     assert all(torch.equal(again.state[name], value) for name, value in whole.state.items())
-    ended = run(kind, held, checkpoints / "killed", AtStep(1, pytest.fail))
+    hook = register_optimizer_step_pre_hook(lambda *_: pytest.fail("trained again"))
+    ended = run(kind, held, checkpoints / "killed")
+    hook.remove()
     assert ended.history == whole.history, "what is trained waits for the stage to write it"
 
 
@@ -156,11 +144,6 @@ def test_what_is_trained_is_float32_and_comes_back(dtype: str, held: Material, c
         for name, value in model.named_parameters():
             value.copy_(value.to(getattr(torch, dtype)) if "lora_" in name else value)
     assert_comes_back(model, checkpoints / "saved", dtype=dtype)
-    write_model_card(checkpoints / "saved", held, data, CONFIG)
-    card = (checkpoints / "saved" / "README.md").read_text()
-    assert all(
-        line in card for line in ("fine-tuned with LoRA", "| rank | 4 |", f"language model: `{language.weights}")
-    )
 
 
 def test_training_goes_on_from_a_trained_model(held: Material, checkpoints: Path, tmp_path: Path) -> None:
@@ -175,8 +158,6 @@ def test_training_goes_on_from_a_trained_model(held: Material, checkpoints: Path
     fit(model, data, SMALL, CPU, Job("align", "x", 0))
     changed = {name for name, value in model.named_parameters() if not torch.equal(before[name], value)}
     assert {name.split(".")[0] for name in changed} == {"connector"}
-    with refused("lora.rank: the adapter to train on has 4; set lora.rank=4"):
-        add_lora(model, CONFIG.model_copy(update={"rank": 8}))
     with refused(r"lora.target_modules: the adapter to train on has \[k_proj,q_proj\]; set lora.target_modules=\["):
         add_lora(model, CONFIG.model_copy(update={"target_modules": "all-linear"}))
     add_lora(model, CONFIG)
@@ -184,12 +165,6 @@ def test_training_goes_on_from_a_trained_model(held: Material, checkpoints: Path
     after = {name for name, value in model.named_parameters() if not torch.equal(before[name], value)}
     assert {name for name in before if "lora_" in name} <= after
     assert not {name for name in after if name.startswith("llm") and "lora_" not in name}
-    everywhere = CONFIG.model_copy(update={"target_modules": "all-linear"})
-    adapted(assemble(held, CONFIG, "test")[0], everywhere).save_pretrained(tmp_path / "begun" / "language")
-    model, _ = assemble(went_on, CONFIG, "lora")
-    add_lora(model, everywhere)
-    with refused("lora.target_modules: the adapter to train on has all-linear"):
-        add_lora(model, CONFIG)
     other = replace(went_on, store=write_store(tmp_path / "other", [("a_0", 0, "none")], torch.zeros(1, DIM + 1)))
     with refused(f"begun reads embeddings of {DIM}, but the encoder gives {DIM + 1}; set encoder.backbone"):
         assemble(other, CONFIG, "align")
@@ -265,8 +240,6 @@ def test_a_training_is_not_gone_on_with_by_another_version_of_the_code(
     ("name", "value", "words"),
     [
         ("ACCELERATE_MIXED_PRECISION", "bf16", "ACCELERATE_MIXED_PRECISION is bf16"),
-        ("ACCELERATE_DYNAMO_BACKEND", "INDUCTOR", "ACCELERATE_DYNAMO_BACKEND is INDUCTOR"),
-        ("ACCELERATE_USE_DEEPSPEED", "true", "ACCELERATE_USE_DEEPSPEED is true"),
         ("ACCELERATE_USE_FSDP", "true", "FSDP_VERSION is 1"),
         ("WORLD_SIZE", "3", "micro_batch_size 2 on 3 devices does not divide batch_size 4"),
     ],

@@ -100,12 +100,3 @@ def test_rows_say_what_scenes_measure_as(recipes: dict[str, Recipe], catalogue: 
         assert row.hardness == catalogue.labels(row.object_id)[catalogue.property_index("hardness")]
     agreeing = [(r.hardness, r.roughness, r.bumpiness) == catalogue.labels(r.object_id) for r in rows]
     assert share_as_labelled(rows, catalogue) == pytest.approx(np.mean(agreeing), abs=1e-4)
-
-
-def test_unknown_objects_and_unwritable_folders_are_named(recipes: dict[str, Recipe], tmp_path: Path) -> None:
-    with refused(r"scenes\.objects: yoyo"):
-        synthesize(recipes, ScenesConfig(objects=("rug", "yoyo")), tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-    (tmp_path / "file").write_text("in the way")
-    with pytest.raises(FileExistsError, match="file"):
-        synthesize(recipes, SMALL, tmp_path / "file")

@@ -10,7 +10,6 @@ import pytest
 
 from pipeline.core.records import Opd, Part, Question
 from pipeline.scenes.motion import make_motion
-from pipeline.scenes.recipe import load_recipes
 from pipeline.tasks.base import Pool
 from pipeline.tasks.questions import build_questions
 from pipeline.videos.catalogue import Catalogue, load_catalogue
@@ -79,29 +78,6 @@ def test_a_rank_that_is_no_number_is_one_line(tmp_path: Path, value: str) -> Non
     (tmp_path / "objects.csv").write_text(f'{header}\nkiwi,a kiwi,1,2,1,"{value}"\n')
     with refused(r"objects\.csv, line 2: ripeness_kiwi is .*larger for riper"):
         load_catalogue(tmp_path)
-
-
-def test_the_example_lists_physiclears_objects_as_they_are() -> None:
-    physiclear = load_catalogue(PHYSICLEAR)
-    for object_id, entry in physiclear.objects.items():
-        mine = CATALOGUE.objects[object_id]
-        assert (mine.name, mine.ratings, mine.material) == (entry.name, entry.ratings, entry.material)
-        assert mine.splits["avocado"] in {entry.splits["paper"], Part.UNUSED}
-    assert sorted(CATALOGUE.objects.keys() - physiclear.objects.keys()) == sorted(TESTED)
-    bare = [p.model_copy(update={"cues": ()}) for p in physiclear.properties]
-    assert list(CATALOGUE.properties) == bare
-    for name in ("structured", "unstructured"):
-        assert getattr(CATALOGUE.language, name) == getattr(physiclear.language, name)
-
-
-def test_the_examples_fruits_are_graded_and_only_pressed() -> None:
-    recipes = load_recipes(EXAMPLE, CATALOGUE, 0)
-    assert len({recipes[o].modulus for o in TESTED}) == len(TESTED) == 10
-    harder = sorted(TESTED, key=lambda o: recipes[o].modulus)
-    ranks = [CATALOGUE.objects[o].ripeness["avocado"] for o in harder]
-    assert ranks == sorted(ranks, reverse=True), "the softer, the riper"
-    assert all(not recipes[o].twist for o in TESTED)
-    assert recipes["rug"].twist
 
 
 def test_a_hand_that_only_presses_turns_nothing() -> None:

@@ -50,7 +50,6 @@ class Tab:
         return done["result"].get("value")
 
     def until(self, script: str) -> None:
-        """Wait until an expression is true."""
         end = time.monotonic() + HUNG
         while not self.run(f"!!({script})"):
             said = self.run("document.body?.innerText")
@@ -64,7 +63,6 @@ class Tab:
         self.call("DOM.setFileInputFiles", nodeId=node, files=[str(file) for file in files])
 
     def type(self, selector: str, text: str) -> None:
-        """Type a text and press enter."""
         self.run(f"document.querySelector({json.dumps(selector)}).focus()")
         self.call("Input.insertText", text=text)
         for kind in ("keyDown", "keyUp"):

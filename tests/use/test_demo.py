@@ -104,8 +104,6 @@ def test_an_answer_that_nobody_hears_ends(site: str, session: Session) -> None:
 
 
 def said(session: Session, **asked: Any) -> str:
-    """A whole answer."""
-
     async def whole() -> str:
         return "".join([piece async for piece in await session.stream(Asked(**asked))])
 
@@ -120,11 +118,9 @@ def test_what_is_wrong_comes_back_as_one_line(site: str, tmp_path: Path) -> None
     asked = {"question": "{tactile}?", "touches": []}
     for place, body, told in (
         ("touches/a.mp4", {}, "a.mp4: empty (0 bytes); copy it again, or remove it"),
-        ("touches/notes.txt", {"content": b"no video"}, "notes.txt: no video by its name"),
         ("touches/..%5C..%5Ca.mp4", {"content": b"no video"}, "no frame decodes"),
         ("ask", {"json": asked}, "the question has 1 {tactile} for 0 videos"),
         ("ask", {"json": {**asked, "touches": ["0"]}}, "1 touches are forgotten; begin a new conversation"),
-        ("scenes/nothing", {}, "nothing: no such scene"),
     ):
         answer = httpx2.request("POST" if place == "ask" else "PUT", f"{site}/api/{place}", timeout=HUNG, **body)
         assert answer.status_code == 422

@@ -24,7 +24,6 @@ EXAMPLES = ROOT / "examples"
 
 
 def commands(readme: Path) -> list[list[str]]:
-    """The commands of all shell blocks."""
     blocks = re.findall(r"```sh\n(.*?)```", readme.read_text(encoding="utf-8"), re.DOTALL)
     return [shlex.split(line) for block in blocks for line in block.splitlines()]
 

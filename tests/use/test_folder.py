@@ -109,8 +109,6 @@ def test_a_base_by_name_and_one_in_a_known_place(copy: Path, llama: Path, tmp_pa
     words = json.loads(tokenizer.read_text())
     tokenizer.write_text(json.dumps(words))
     assert Octopi.from_pretrained(copy, base=other).doubts == (OTHER_BASE,), "the same words in another file"
-    with refused(r"deep: is another language model"):
-        Octopi.from_pretrained(copy, base=write_llama(tmp_path / "deep", num_hidden_layers=3))
     own = (tmp_path / "llama").rename(tmp_path / "away")
     with refused(r"base: is another language model .*tokenizer.json differs"):
         Octopi.from_pretrained(copy, base=other)
@@ -127,14 +125,11 @@ def test_a_base_by_name_and_one_in_a_known_place(copy: Path, llama: Path, tmp_pa
         Octopi.from_pretrained(copy, base=other)
 
 
-def test_another_version_and_other_frames_are_refused(copy: Path, llama: Path) -> None:
+def test_frames_of_another_setting_are_refused(copy: Path, llama: Path) -> None:
     frames = json.loads((copy / "config.json").read_text())["frames"]
     edit(copy / "config.json", frames={**frames, "per_video": 4})
     with refused("frame settings are not those of training"):
         Octopi.from_pretrained(copy, base=llama)
-    edit(copy / "config.json", format=FORMAT + 1)
-    with refused(f"of format {FORMAT + 1}, but this version reads {FORMAT}"):
-        Octopi.from_pretrained(copy)
 
 
 @pytest.mark.parametrize("name", ["encoder/encoder.safetensors", "language/connector.safetensors", "catalogue.json"])
@@ -151,7 +146,11 @@ def test_a_changed_or_missing_file_is_named(name: str, copy: Path) -> None:
 def test_what_is_no_model_is_refused(tmp_path: Path) -> None:
     with refused("holds no config.json"):
         Octopi.from_pretrained(tmp_path)
-    for text, message in (("{", "not JSON"), ("[]", "of format None"), (f'{{"format": {FORMAT}}}', "Field required")):
+    for text, message in (
+        ("{", "not JSON"),
+        ('{"format": 0}', f"of format 0, .* {FORMAT}"),
+        (f'{{"format": {FORMAT}}}', "Field required"),
+    ):
         (tmp_path / "config.json").write_text(text)
         with refused(message):
             Octopi.from_pretrained(tmp_path)

@@ -101,8 +101,6 @@ def test_what_is_pushed_comes_back_and_answers_the_same(
     [
         ([], {}, "there is no token"),
         ([], {"HF_TOKEN": "bob"}, "this token may not write"),
-        ([], {"HF_TOKEN": "ann", "HF_HUB_OFFLINE": "1"}, "HF_HUB_OFFLINE is set"),
-        ([], {"HF_TOKEN": "ann", "HF_ENDPOINT": "http://127.0.0.1:9"}, "the Hub does not do it"),
         (["--private"], {"HF_TOKEN": "ann"}, "is there already, and public"),
     ],
 )

@@ -18,7 +18,6 @@ import pytest
 from pipeline.use.serve import make_app
 from pipeline.use.server import Failed
 from tests.closure import ROOT, imported
-from tests.conftest import deaf_port
 from tests.frame_rules import decode
 from tests.use.fake import FakeOctopi, digest, running
 from tests.use.videos import press
@@ -135,6 +134,5 @@ def test_what_goes_wrong_is_one_line_of_the_server(node: Any, tmp_path: Path, mo
         assert "\n" not in result.error
     monkeypatch.setenv("OCTOPI_TOKEN", "another")
     assert "token" in node.execute(goal("Soft?", notes)).error
-    with deaf_port() as port:
-        node.url = f"http://127.0.0.1:{port}"
-        assert "is `octopi serve` running?" in node.execute(goal("Soft?", notes)).error
+    node.url = "http://127.0.0.1:9"  # Where nothing listens.
+    assert "is `octopi serve` running?" in node.execute(goal("Soft?", notes)).error

@@ -57,14 +57,6 @@ def test_every_broken_file_is_found_and_raises_nothing(tmp_path: Path, catalogue
     assert {e for e in errors if e[0] in ("name", "decodes")} <= checked
 
 
-def test_no_folder_or_an_empty_one_is_an_error_beside_the_labels(tmp_path: Path, catalogue: Catalogue) -> None:
-    for folder in (tmp_path, tmp_path / "none"):
-        findings = audit_folder(folder, catalogue, PAPER)
-        assert [f.check for f in findings if f.severity is ERROR] == ["name"]
-        assert of(findings, "stated label"), "labels need no video"
-        assert [f.severity for f in check_folder(folder, catalogue)] == [ERROR]
-
-
 @pytest.fixture
 def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """What the stage reads: parameters, measurements, a split, and files that only have to have names."""

@@ -30,24 +30,21 @@ def test_flawless_videos_no_videos_and_a_single_one_give_no_warning() -> None:
         ("length", {"frames": 62, "header_frames": 62}, {"frames": 63, "header_frames": 63}),
         ("frames that decode", {"header_frames": 130}, {"header_frames": 0}),
         ("brightness", {"brightness": 83.0}, {"brightness": 84.0}),
-        ("brightness", {"brightness": 97.0}, {"brightness": 96.0}),
         ("brightness", {"brightness_step": 4.1}, {"brightness_step": 4.0}),
         ("saturation", {"saturated": 0.06}, {"saturated": 0.05}),
         ("colours", {"hdr": True}, {}),
         ("rotation", {"rotation": 90}, {}),
         ("frame rate", {"irregular": 1.6}, {"irregular": 1.5}),
-        ("frame rate", {"irregular": 2.0}, {"irregular": 0.0}),
         ("frames kept", {"kept": 0}, {"kept": 1}),
         ("contact", {"contact": 0.49}, {"contact": 0.51}),
         ("contact at the end", {"contact_end": 0.71}, {"contact_end": 0.7}),
         ("contact at the end", {"contact": 0.6, "contact_end": 0.51}, {"contact": 0.6, "contact_end": 0.5}),
         ("light at the start", {"unsteady": 8}, {}),
-        ("light at the start", {"unsteady": 126}, {}),
         ("contact at the start", {"starts_touching": True}, {}),
     ],
 )
 def test_one_odd_video_is_one_warning(check: str, beyond: dict[str, object], within: dict[str, object]) -> None:
-    """And within the limit none: containers may promise no number of frames (0), and have no time stamps (0)."""
+    """And within the limit none: containers may promise no number of frames (0)."""
     for changes, expected in ((beyond, [(check, "rug_1.mov", WARNING)]), (within, [])):
         found = [p if p.video_id != "rug_1" else probe("rug_1", **changes) for p in probes()]
         assert [(f.check, f.item, f.severity) for f in odd(check_files(found, OTHER))] == expected

@@ -39,7 +39,6 @@ def warnings(listing: Listing) -> list[str]:
 
 
 def test_a_good_folder(tiny_videos: Path, tmp_path: Path, catalogue: Catalogue) -> None:
-    """Sorted by object, then by number."""
     folder = Path(shutil.copytree(tiny_videos, tmp_path / "v"))
     listing = list_videos(folder, catalogue)
     names = ["baseball_0", "baseball_1", "baseball_10", "potato_0", "potato_2", "rug_0", "rug_1"]
@@ -96,10 +95,8 @@ def test_objects_outside_the_catalogue_are_left_out_with_one_line(tmp_path: Path
     ("make", "words"),
     [
         (lambda folder: folder.rmdir(), ["no such folder", "data.dir"]),
-        (lambda folder: touch(folder, "notes.txt"), ["no video", ".mov", "data.dir"]),
         (lambda folder: touch(folder, "yoyo_0.mov"), ["no video of an object", "yoyo", "objects.csv"]),
         (lambda folder: touch(folder, "rug.avi"), ["rug.avi", "<object>_<number>", "rename", "videos.csv"]),
-        (lambda folder: touch(folder, "rug_٣.avi"), ["<object>_<number>"]),
         (lambda folder: touch(folder, "rug_0.avi", "sub/rug_00.mp4"), ["rug_0.avi", "sub/rug_00.mp4", "keep one"]),
     ],
 )
@@ -189,11 +186,8 @@ def test_lists_are_read_as_people_write_them(tmp_path: Path, catalogue: Catalogu
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("name,object\na.mov,rug\n", "column file, object_id is missing"),
-        ("file,object_id\n", "lists no video; add a line for each"),
         ("file,object_id\na.mov,rug\ngone.mov,rug\n", "line 3: no video 'gone.mov' in the folder; correct the line"),
         ("file,object_id\na.mov,rug\n\na.mov,potato\n", "line 4: a.mov is listed twice; keep one line"),
-        ("file,object_id\na.mov,\n", "line 2: a.mov has no object_id"),
         ("file,object_id\na.mov,yoyo\n", "no video of an object of the catalogue"),
         ("file,object_id\né.avi,rug\n", "no CSV in UTF-8"),
     ],

@@ -8,7 +8,6 @@ from pickle import UnpicklingError
 import open_clip
 import pytest
 import torch
-from transformers import AutoTokenizer
 from typer.testing import CliRunner
 
 from pipeline.cli import app
@@ -49,19 +48,6 @@ def test_tiny_models_follow_from_the_seed(name: str, tmp_path: Path) -> None:
     assert again == first
     assert {n for n in first if other[n] != first[n]} == {n for n in first if n.endswith(".safetensors")}
     assert sum(map(len, first.values())) < 12e6
-
-
-def test_tiny_llamas_tokenizer() -> None:
-    tokenizer = AutoTokenizer.from_pretrained(model_folder("tiny-llama"), local_files_only=True)
-    assert tokenizer.chat_template is None, "so that Vicuna's format is used"
-    named = (tokenizer.pad_token, tokenizer.bos_token, tokenizer.eos_token, tokenizer.unk_token)
-    assert named == ("<pad>", "<s>", "</s>", "<unk>")
-    for text in ("Überraschung! 東京 \n\t 1.5", "a hard and smooth surface with no bumps", ""):
-        ids = tokenizer(text).input_ids
-        assert tokenizer.unk_token_id not in ids
-        assert tokenizer.decode(ids, skip_special_tokens=True, clean_up_tokenization_spaces=False) == text
-    words = "presents a hard and smooth surface with no bumps"
-    assert len(tokenizer(words).input_ids) <= 2 * len(words.split())
 
 
 def test_random_models_have_the_published_shapes() -> None:
@@ -136,17 +122,3 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert CliRunner().invoke(app, ["weights", "tiny-clip"]).exit_code == 0
     assert CliRunner().invoke(app, ["weights", "tiny-clip", "--to", "else/where"]).exit_code == 0
     assert contents(Path("weights/tiny-clip")) == contents(Path("else/where")) == contents(model_folder("tiny-clip"))
-
-
-@pytest.mark.parametrize(
-    ("text", "front"),
-    [
-        (b"---\nlicense: mit\n---\n# A model", {"license": "mit"}),
-        (b"---\nlicense: a: b\n---\n", {}),
-        (b"---\nauthor: M\xfcller\n---\n", {}),
-        (b"---\n\nA rule, and no front matter.\n", {}),
-    ],
-)
-def test_a_foreign_card_is_no_obstacle(text: bytes, front: dict[str, str], tmp_path: Path) -> None:
-    (tmp_path / "README.md").write_bytes(text)
-    assert front_matter(tmp_path) == front

@@ -2,39 +2,36 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import logging
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import av
 import pandas as pd
 
-from pipeline.core.io import remove_rests, write_csv
-from pipeline.running.errors import UserError, did_you_mean
-from pipeline.videos.catalogue.csv_reader import read_rows
+from pipeline.core.io import atomic, remove_rests
+from pipeline.running.errors import UserError, counted, did_you_mean
+from pipeline.videos.catalogue.csv_reader import Row, read_rows
 from pipeline.videos.decoding import CONTAINERS, video_stream
 from pipeline.videos.files import LIST_FILE
-from pipeline.videos.importing.presses import NothingTouchesError, Recorded, Shot, cut, film, first_free
+from pipeline.videos.importing.presses import NothingTouchesError, cut, film, first_free
 
 log = logging.getLogger(__name__)
 
-VERSIONS = ("v2.1", "v3.0")
+COLUMNS = ["file", "object_id", "session", "video"]
+"""Of the `videos.csv` beside imported episodes; `video` is the camera's key in the dataset."""
 PLACE = ("chunk_index", "file_index", "from_timestamp")
 """Where v3.0 keeps an episode's video; the numbers of a file's folder and of the file, and seconds in it."""
 REORDERED = 16
 """Frames that H.264 and HEVC store before one that is shown earlier, at most."""
-
-
-class Imported(Recorded):
-    """A row of the `videos.csv` beside imported episodes."""
-
-    video: str
-    """The camera's key in the dataset."""
+AGAIN = "download the dataset again"
 
 
 @dataclass(frozen=True)
@@ -46,10 +43,7 @@ class Episode:
     session: str
     """Dataset, episode, and its seconds in the video: the same for all presses and cameras of an episode."""
     file: Path
-    first: int
-    """Position in the file of the episode's first frame."""
-    length: int
-    """Number of frames."""
+    frames: range
     fps: float
 
 
@@ -72,46 +66,53 @@ def import_episodes(
         UserError: if the dataset is incomplete or of another layout, or a name is unusable.
     """
     found = read_episodes(root, key)
-    names = _object_ids(root, found, objects)
-    listed, fields = out / LIST_FILE, list(Imported.model_fields)
-    rows = (
-        [Imported(**{f: row[f] for f in fields}) for _, row in read_rows(listed, fields)[1]] if listed.exists() else []
-    )
-    known = {row.session for row in rows if row.video == key}
-    wanted = [episode for episode in found if episode.number in names]
-    new = [episode for episode in wanted if episode.session not in known]
-    if len(new) < len(wanted):
-        log.warning("%s: lists %d of %d episodes, which stay as they are", listed, len(wanted) - len(new), len(wanted))
+    names, listed = _object_ids(root, found, objects), out / LIST_FILE
+    header, lines = read_rows(listed, COLUMNS) if listed.exists() else (COLUMNS, [])
+    rows = [row for _, row in lines]
+    known = {row["session"] for row in rows if row["video"] == key}
+    if known:
+        log.warning("%s: lists %s already; they stay as they are", listed, counted(len(known), "episode"))
     out.mkdir(parents=True, exist_ok=True)
     remove_rests(out)
-    written = list[Path]()
-    for episode in new:
+    part, written = out / f".episode.{os.getpid()}.part.mp4", list[Path]()
+    for episode in found:
+        if episode.number not in names or episode.session in known:
+            continue
         object_id = names[episode.number]
         try:
-            videos = _write(episode, out, object_id, times, pressed)
+            if copy(episode, part) > len(episode.frames) or pressed:
+                # Half a frame before the next one, so that rounded times take no frame too many.
+                read = partial(film, part, end=(len(episode.frames) - 0.5) / episode.fps)
+                name = f"{episode.file}, episode {episode.number}"
+                videos = cut(read, name, out, object_id, times, whole=not pressed)
+            else:
+                videos = [part.replace(out / f"{object_id}_{first_free(out, object_id)}.mp4")]
         except NothingTouchesError as problem:
             log.warning("%s; this episode is left out", problem)
             continue
+        finally:
+            part.unlink(missing_ok=True)
+        for video in videos:
+            rows.append(Row(file=video.name, object_id=object_id, session=episode.session, video=key))
+        with atomic(listed) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
+            writer = csv.DictWriter(stream, header, lineterminator="\n")  # With the columns that a person added.
+            writer.writeheader()
+            writer.writerows(rows)
         written += videos
-        rows += [Imported(file=v.name, object_id=object_id, session=episode.session, video=key) for v in videos]
-        write_csv(listed, Imported, rows)
     return written
 
 
 def read_episodes(root: Path, key: str) -> list[Episode]:
     """The episodes of a dataset, in order, with their places in the videos of a camera."""
-    file = root / "meta/info.json"
-    if not file.is_file():
-        raise UserError(f"{root}: no LeRobot dataset, as it lacks meta/info.json; name the folder that holds meta/")
+    file, rows, found = root / "meta/info.json", list[dict[str, Any]](), []
     try:
         info = json.loads(file.read_text(encoding="utf-8"))
         version, fps, total = info["codebase_version"], float(info["fps"]), info["total_episodes"]
-        if version not in VERSIONS:
-            raise UserError(f"{file}: codebase_version {version}; convert it with LeRobot to {' or '.join(VERSIONS)}")
+        if version not in ("v2.1", "v3.0"):
+            raise UserError(f"{file}: codebase_version {version}; convert it with LeRobot to v2.1 or v3.0")
         keys = [name for name, feature in info["features"].items() if feature["dtype"] == "video"]
         if key not in keys:
             raise UserError(f"{file}: no video {key}; {did_you_mean(key, keys)}its videos: {', '.join(keys) or 'none'}")
-        rows = list[dict[str, Any]]()
         if version == "v3.0":
             columns = ["episode_index", "tasks", "length", *(f"videos/{key}/{name}" for name in PLACE)]
             for file in sorted(root.glob("meta/episodes/*/*.parquet")):
@@ -120,36 +121,30 @@ def read_episodes(root: Path, key: str) -> list[Episode]:
             file = root / "meta/episodes.jsonl"
             rows += map(json.loads, file.read_text(encoding="utf-8").splitlines())
         if len(rows) != total:
-            raise UserError(f"{root}/meta: {len(rows)} of {total} episodes are listed; download the dataset again")
-        found = []
+            raise UserError(f"{root}/meta: {len(rows)} of {total} episodes are listed; {AGAIN}")
         for row in sorted(rows, key=lambda row: row["episode_index"]):
             number, length = row["episode_index"], row["length"]
-            chunk, index, begin = (row.get(f"videos/{key}/{name}", 0) for name in PLACE)
-            video = info["video_path"].format(
-                video_key=key,
-                chunk_index=chunk,
-                file_index=index,
-                episode_chunk=number // info["chunks_size"],
-                episode_index=number,
-            )
+            place = {name: row.get(f"videos/{key}/{name}", 0) for name in PLACE}
+            place |= {"video_key": key, "episode_index": number, "episode_chunk": number // info["chunks_size"]}
+            video, begin = root / info["video_path"].format(**place), place["from_timestamp"]
             session = f"{root.resolve().name} episode {number} ({begin:.3f} to {begin + length / fps:.3f} s)"
             # Times are running sums, which comparing would take a frame too many or too few by.
             first = round(begin * fps)
-            found.append(Episode(number, " ".join(row["tasks"]).strip(), session, root / video, first, length, fps))
+            task = " ".join(row["tasks"]).strip()
+            found.append(Episode(number, task, session, video, range(first, first + length), fps))
     except FileNotFoundError:
-        raise UserError(f"{file}: is missing; download the dataset again") from None
+        raise UserError(f"{file}: is missing; name a LeRobot dataset's folder, or {AGAIN}") from None
     except (AttributeError, LookupError, TypeError, ValueError) as problem:  # What JSON, pandas and a wrong key raise.
         reason = " ".join(str(problem).split())
-        raise UserError(f"{file}: not as LeRobot writes it ({reason}); download the dataset again") from None
+        raise UserError(f"{file}: not as LeRobot writes it ({reason}); {AGAIN}") from None
     return found
 
 
 def _object_ids(root: Path, found: Sequence[Episode], table: Path | None) -> dict[int, str]:
     """The object's id of each episode that is wanted, by number."""
-    ids = dict[int, str]()
-    if table is None:
-        ids = {episode.number: re.sub(r"\W+", "_", episode.task.lower()).strip("_") for episode in found}
-    else:
+    ids = {episode.number: re.sub(r"\W+", "_", episode.task.lower()).strip("_") for episode in found}
+    if table is not None:
+        ids = {}
         header, rows = read_rows(table, ("object_id",))
         column = "episode" if "episode" in header else "task"
         if column not in header:
@@ -168,64 +163,36 @@ def _object_ids(root: Path, found: Sequence[Episode], table: Path | None) -> dic
     return ids
 
 
-def _write(episode: Episode, out: Path, object_id: str, times: float, pressed: bool) -> list[Path]:
-    part = out / f".episode.{os.getpid()}.part.mp4"
-    try:
-        before, exact = _copy(episode, part)
-        if not pressed and exact:
-            path = out / f"{object_id}_{first_free(out, object_id)}.mp4"
-            os.replace(part, path)
-            return [path]
-        name = f"{episode.file}, episode {episode.number}"
-        return cut(lambda: _shots(part, before, episode), name, out, object_id, times, whole=not pressed)
-    finally:
-        part.unlink(missing_ok=True)
-
-
-def _copy(episode: Episode, part: Path) -> tuple[int, bool]:
-    """Copy an episode's packets, from the last frame before it that is coded alone.
-
-    Returns:
-        Frames that stand before it in the copy, and whether the copy has its frames and no others.
-    """
-    held = list[tuple[int, Any]]()
-    wanted = set(range(episode.first, episode.first + episode.length))
+def copy(episode: Episode, part: Path) -> int:
+    """Copy an episode's packets, and those before that decoding them takes, which no player shows; how many in all."""
+    held, wanted = list[tuple[int, Any]](), set(episode.frames)
     try:
         with av.open(f"file:{episode.file}", options=CONTAINERS) as source:
             stream = video_stream(source)
-            source.seek(round(max(0, episode.first - REORDERED) / episode.fps * av.time_base))
+            source.seek(round(max(0, episode.frames.start - REORDERED) / episode.fps * av.time_base))
             for packet in source.demux(stream):
                 if packet.pts is None or packet.is_corrupt:
                     continue
                 number = round(float(packet.pts * packet.time_base) * episode.fps)
-                if packet.is_keyframe and number <= episode.first:
+                if packet.is_keyframe and number <= episode.frames.start:
                     held = []
                 held.append((number, packet))
                 wanted.discard(number)
                 if not wanted:
                     break
             if wanted:
-                lacking = f"lacks {len(wanted)} of {episode.length} frames of episode {episode.number}"
-                raise UserError(f"{episode.file}: {lacking}; download the dataset again")
-            begin, start = held[0][0], held[0][1].pts
-            # Frames that are stored behind it but shown before it are coded as changes to what is not copied.
-            held = [(number, packet) for number, packet in held if number >= begin]
-            with av.open(f"file:{part}", "w", options={"fflags": "+bitexact"}) as copy:
+                lacking = f"lacks {len(wanted)} of {len(episode.frames)} frames of episode {episode.number}"
+                raise UserError(f"{episode.file}: {lacking}; {AGAIN}")
+            # Frames before it get negative times, which go into an edit list and are not shown.
+            start = next(packet.pts for number, packet in held if number == episode.frames.start)
+            with av.open(f"file:{part}", "w", options={"fflags": "+bitexact"}) as target:
                 # Opaque, since an encoder of the codec is neither needed nor always there.
-                to = copy.add_stream_from_template(stream, opaque=True)
+                to = target.add_stream_from_template(stream, opaque=True)
                 for _, packet in held:
                     packet.pts, packet.dts, packet.stream = packet.pts - start, packet.dts - start, to
-                    copy.mux(packet)
+                    target.mux(packet)
     except FileNotFoundError:
-        raise UserError(f"{episode.file}: is missing; download the dataset again") from None
+        raise UserError(f"{episode.file}: is missing; {AGAIN}") from None
     except (av.FFmpegError, ValueError) as problem:
-        raise UserError(f"{episode.file}: no whole video ({problem}); download the dataset again") from None
-    return episode.first - begin, len(held) == episode.length
-
-
-def _shots(part: Path, before: int, episode: Episode) -> Iterator[Shot]:
-    """The pictures of an episode at their times from its beginning, of a copy in which so many others stand before."""
-    begin, end = ((place - 0.5) / episode.fps for place in (before, before + episode.length))
-    late = round(1e9 * before / episode.fps)
-    for shot in film(part, 0.0, begin, end):
-        yield Shot(shot.picture, shot.recorded - late, shot.stamped - late)
+        raise UserError(f"{episode.file}: no whole video ({problem}); {AGAIN}") from None
+    return len(held)
