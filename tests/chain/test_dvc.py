@@ -17,6 +17,8 @@ from dvc.stage.cache import _get_cache_hash
 from dvc.stage.serialize import to_single_stage_lockfile
 
 from pipeline import config
+from pipeline.core import layout
+from pipeline.core.records import Lora, Variant
 from tests.closure import ROOT, closure
 from tests.project import OBJECTS, REDUCED, copy_project
 
@@ -69,6 +71,16 @@ def test_dependencies_cover_what_a_stage_can_import(name: str) -> None:
     assert not missing, f"add to the dependencies of {name} in dvc.yaml"
     idle = [d for d in code(name) if d in told or not any(m == d or m.startswith(f"{d}/") for m in reached)]
     assert not idle, f"{name} has no use for these dependencies"
+
+
+def test_the_layout_is_that_of_the_outputs() -> None:
+    axes: Any = [f"${{item.{axis}}}" for axis in Variant._fields]
+    variant, places = Variant(*axes), {path for path in vars(layout).values() if isinstance(path, Path)}
+    made = {layout.answers_dir(variant), layout.encoder_dir(variant.seed), layout.AUDIT / "passed"}
+    made |= {layout.trained_dir(variant._replace(lora=lora)) for lora in Lora}
+    made |= {layout.split_file(0).parent, layout.embeddings_dir(variant.encoder, 0).parent, layout.PRETRAINED.parent}
+    made |= {place for place in places if place.parent == layout.DATA} - {layout.AUDIT}
+    assert {str(path) for path in made} <= {str(out) for stage in stages().values() for out in stage.get("outs", [])}
 
 
 def test_config_computes_nothing_else() -> None:
@@ -145,13 +157,13 @@ EDITS = {
     "pipeline/report/tables.py": {"report", "publish"},
     "pipeline/running/progress.py": set(),
     "pipeline/weights/backbones.py": {
-        *("weights", "pretrain", "finetune_encoder", "embed", "shipped"),
+        *("weights", "pretrain", "finetune_encoder", "embed", "evaluate"),
         "report",
         "package",
     },
-    "pipeline/evaluation/grading.py": {"grade", "shipped", *RUNS_ALL},
-    "pipeline/tasks/pc.py": {"questions", "grade", "shipped", *RUNS_ALL},
-    "pipeline/language/chat.py": {"align", "lora", "answer", "shipped", "report", "package"},
+    "pipeline/evaluation/grading.py": {"grade", "evaluate", *RUNS_ALL},
+    "pipeline/tasks/pc.py": {"questions", "grade", "evaluate", *RUNS_ALL},
+    "pipeline/language/chat.py": {"align", "lora", "answer", "evaluate", "report", "package"},
 }
 """A row of a report, a column of its tables, a line of progress, a backbone, a grader, a prompt and its grader, a chat
 format: and the stages that an edit makes stale. What follows these runs where their outputs come out otherwise."""

@@ -194,23 +194,3 @@ def test_it_is_not_asked_about_properties_or_classes_of_others(
     params = compose("smoke", ["evaluate.questions=4", f"data.catalogue={ROOT}/pipeline/physiclear"], ROOT / "conf")
     assert answers_about(cast(Octopi, model), params, fake_videos(["rug"]), {}) == []
     assert re.search(r"octopi-small is not asked: .*(warmth: soft|yielding).*, but .*hardness: soft", caplog.text)
-<<<<<<< HEAD
-=======
-
-
-@pytest.mark.slow
-def test_a_copy_for_another_sensor_standardises_by_its_videos(octopi: Octopi, tmp_path: Path) -> None:
-    """Against float64 of what its heads' logits are; the property heads stay, and the copy is whole."""
-    videos = [EXAMPLES / f"{name}.mp4" for name in ("soft", "hard", "rough")]
-    adapt(octopi, videos, tmp_path / "mine")
-    mine = Octopi.from_pretrained(tmp_path / "mine", base=model_folder("smollm2"), dtype="float32")
-    before, after = (torch.cat([m.encoder.encode(v).features for v in videos]).double() for m in (octopi, mine))
-    expected = (before - before.mean(0)) / before.std(0, correction=0)
-    torch.testing.assert_close(after, expected, rtol=1e-4, atol=1e-4)
-    assert [mine.encoder.classify(v) for v in videos] == [octopi.encoder.classify(v) for v in videos]
-    assert not mine.config.scores, "they were another's"
-    assert mine.ask("Is it soft?", videos[0])
-    told = tmp_path / "mine" / "config.json"
-    edit(told, language={**read_json(told)["language"], "touch_noise": 0.0})
-    assert read_folder(tmp_path / "mine")[0] == mine.config, "as models of before say it"
->>>>>>> 293fa7c100d90a05413fce4620b5c82aa9c24a2a

@@ -129,14 +129,6 @@ def test_a_killed_extraction_goes_on_where_it_was(place: Place, whole: list[byte
     assert list(place.partial.iterdir()) == []
 
 
-def test_a_kill_while_tables_are_written_decodes_nothing_again(place: Place, whole: list[bytes]) -> None:
-    with patch.object(extract, "write_table", side_effect=OSError("full")), pytest.raises(OSError, match="full"):
-        place.extract()
-    place.decoded()
-    place.extract()
-    assert (place.decoded(), place.bytes()) == ([], whole)
-
-
 def test_what_changed_after_a_kill_is_read_anew(place: Place) -> None:
     kill_after(5, place)
     place.decoded()
