@@ -78,8 +78,7 @@ def test_what_waits_is_one_batch_and_each_answer_is_the_one_given_alone(
 def test_who_asks_moments_later_is_in_the_same_batch(
     octopi: Octopi, files: list[Path], batches: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.use.server.PAUSE", HUNG)
-    monkeypatch.setattr("pipeline.use.server.TOGETHER", 2)
+    monkeypatch.setattr("pipeline.use.server.PAUSE", 5.0)
 
     async def ask() -> None:
         worker, found = Worker(), []
