@@ -65,9 +65,7 @@ def test_a_video_is_one_for_the_server_for_ask_and_in_a_folder(gate: Gate, suffi
     "data",
     [
         lambda: claims_pixels(40_000, 40_000),
-        lambda: claims_pixels(15_000, 15_000),
         lambda: avi_of_giant_jpegs(15_000, 15_000),
-        lambda: claims_frames(10**6),
         lambda: claims_frames(10**8),
         lambda: video()[:300],
         lambda: bytes(1000),
