@@ -127,7 +127,8 @@ def _in_processes(work: Callable[[J], R], jobs: Sequence[J], label: str) -> Iter
             reply: tuple[R, Exception | None] = pipe.recv()
         except (EOFError, OSError):
             raise _died(label, job) from None
-        idle.put(pipe)
+        finally:
+            idle.put(pipe)  # A dead worker's, too, or who waits for one would wait for ever.
         if reply[1] is not None:
             raise reply[1]
         return reply[0]
