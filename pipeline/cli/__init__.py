@@ -632,9 +632,9 @@ def main() -> None:
     try:
         app()
     except Exception as error:
-        from pipeline.running.stage import system_error
+        from pipeline.running.stage import one_line
 
-        if (line := str(error) if isinstance(error, UserError) else system_error(error)) is None:
+        if (line := one_line(error)) is None:
             raise
         typer.echo(f"octopi: {line}", err=True)
         raise SystemExit(1) from None

@@ -11,10 +11,12 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from importlib.util import find_spec
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, TypeVar
 
 from pipeline.config import Backend
@@ -115,52 +117,49 @@ def _in_processes(work: Callable[[J], R], jobs: Sequence[J], label: str) -> Iter
     the caller's script needs a main guard.
     """
     context = multiprocessing.get_context("fork" if sys.platform == "linux" else None)
-    workers, found, taken = dict[Connection, Any](), dict[int, Any](), context.Value("q")
-    at: dict[Connection, int] = {}
+    workers, idle = list[Any](), SimpleQueue[Connection]()
+
+    def ask(job: J) -> R:
+        """In a thread: have an idle worker do a job."""
+        pipe = idle.get()
+        try:
+            pipe.send(job)
+            reply: tuple[R, Exception | None] = pipe.recv()
+        except (EOFError, OSError):
+            raise _died(label, job) from None
+        finally:
+            idle.put(pipe)  # A dead worker's, too, or who waits for one would wait for ever.
+        if reply[1] is not None:
+            raise reply[1]
+        return reply[0]
+
     # Workers inherit the blocked SIGINT, so that on Ctrl-C only this process reacts, and ends them.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        for _ in range(min(cores(), len(jobs))):
-            here, there = context.Pipe(duplex=False)
-            workers[here] = context.Process(target=_take, args=(os.getpid(), work, jobs, taken, there), daemon=True)
-            workers[here].start()
-            there.close()
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        for number in range(len(jobs)):
-            while number not in found:
-                ready: Any = wait(workers)
-                for pipe in ready:
-                    try:
-                        said = pipe.recv()
-                    except (EOFError, OSError):
-                        raise _died(label, jobs[at.get(pipe, number)]) from None
-                    if isinstance(said, int):
-                        at[pipe] = said
-                    else:
-                        found[at[pipe]] = said
-            result, error = found.pop(number)
-            if error is not None:
-                raise error
-            yield result
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        for worker in workers.values():
-            worker.kill()
-        for worker in workers.values():
-            worker.join()
+    # Its threads begin behind the forks, which would inherit what they lock.
+    with ThreadPoolExecutor(cores()) as threads:
+        try:
+            for _ in range(min(cores(), len(jobs))):
+                here, there = context.Pipe()
+                workers.append(context.Process(target=_serve, args=(os.getpid(), work, there), daemon=True))
+                workers[-1].start()
+                there.close()
+                idle.put(here)
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            yield from threads.map(ask, jobs)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            for worker in workers:
+                worker.kill()
+                worker.join()
 
 
-def _take(parent: int, work: Callable[[J], R], jobs: Sequence[J], taken: Any, pipe: Connection) -> None:
-    """What a worker does until it is ended: take the next job, say its number, and hand over its result or error."""
+def _serve(parent: int, work: Callable[[J], R], pipe: Connection) -> None:
+    """What a worker does until it is ended: take a job, and hand over its result or error."""
     end_with_parent(parent)
     while True:
-        with taken.get_lock():
-            number, taken.value = taken.value, taken.value + 1
-        if number >= len(jobs):
-            threading.Event().wait()
-        pipe.send(number)
+        job = pipe.recv()
         try:
-            pipe.send((work(jobs[number]), None))
+            pipe.send((work(job), None))
         except Exception as error:
             error.add_note(traceback.format_exc())  # Which does not travel.
             pipe.send((None, error))

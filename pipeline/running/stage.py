@@ -14,7 +14,7 @@ import sys
 import time
 from argparse import ArgumentParser
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -134,33 +134,28 @@ def stage(name: str, key: str | None = None, *, launched: bool = False, of_varia
             sys.exit(0)
         if launched:
             launch(params.runtime.launcher)
-        with alone(full):
-            running = Stage(full, params, started)
-            limit_threads(params.runtime.threads)
-            use_backend(params.runtime.parallel)
+        running = Stage(full, params, started)
+        limit_threads(params.runtime.threads)
+        use_backend(params.runtime.parallel)
+        with alone(full) if _main_process() else nullcontext():
             if _main_process():
                 for folder in (DATA, RUNS, REPORTS, MODELS):
                     remove_rests(folder)
                 print(f"{full}: starts ({params.report_name})", flush=True)
             before = _read_by(name, params)
             yield running
-            now = _read_by(name, params)
-            changed = [file for file, _ in before.items() ^ now.items()]
-            changed += [PARAMS_FILE] if load_params() != params else []
-            if changed:
-                file = os.path.relpath(min(changed))
+            changed = {file for file, _ in before.items() ^ _read_by(name, params).items()}
+            if changed or load_params() != params:
+                file = os.path.relpath(min(changed, default=PARAMS_FILE))
                 raise UserError(
                     f"{file} was changed while it ran; the outputs come from the old version, so run the stage again"
                 )
-            if _main_process():
-                _write_run(running)
-                shutil.rmtree(CHECKPOINTS / full, ignore_errors=True)
-                said = ", ".join(f"{k} {v:g}" for k, v in list(running.metrics.items())[:4])
-                print(f"{full}: done in {time.time() - running.started:.1f} s{': ' if said else ''}{said}", flush=True)
-    except UserError as error:
-        sys.exit(f"{full}: {error}")
+            _write_run(running)
+            shutil.rmtree(CHECKPOINTS / full, ignore_errors=True)
+            said = ", ".join(f"{k} {v:g}" for k, v in list(running.metrics.items())[:4])
+            print(f"{full}: done in {time.time() - started:.1f} s{': ' if said else ''}{said}", flush=True)
     except Exception as error:
-        if (line := system_error(error)) is None:
+        if (line := one_line(error)) is None:
             raise
         sys.exit(f"{full}: {line}")
 
@@ -175,17 +170,17 @@ NO_MEMORY = ("out of memory", "can't allocate memory", "CUBLAS_STATUS_ALLOC_FAIL
 """How torch says it, on a GPU and on a processor: by a RuntimeError."""
 
 
-def system_error(error: Exception) -> str | None:
-    """One line for what the operating system refused, in whichever library's words; None for any other error."""
-    number, said = error.errno if isinstance(error, OSError) else None, str(error)
+def one_line(error: Exception) -> str | None:
+    """What a person is told of bad input, or of what the operating system refused; None for any other error."""
+    said = str(error)
+    if isinstance(error, UserError):
+        return said
     if isinstance(error, MemoryError) or any(words in said for words in NO_MEMORY):
         return "out of memory; lower the batch sizes in params.yaml"
-    # How safetensors ends what the operating system said.
-    if found := re.search(r"\(os error (\d+)\)", said):
-        number = int(found[1])
-    # Torch says that it could not write a file, and not why.
-    elif "iostream error" in said or "PytorchStreamWriter failed" in said:
-        number = number or errno.EIO
+    number = error.errno if isinstance(error, OSError) else None
+    # Safetensors ends with the system's number; torch says that it could not write a file, and not why.
+    if found := re.search(r"\(os error (\d+)\)|iostream error|PytorchStreamWriter failed", said):
+        number = int(found[1] or number or errno.EIO)
     where = getattr(error, "filename", None) or f"{DATA}/ or {CHECKPOINTS}/"
     mend = "free space on the disk, or make it readable and writable, and run again"
     return None if number is None else f"{where}: {os.strerror(number)}; {mend}"
@@ -210,9 +205,6 @@ def alone(name: str) -> Iterator[None]:
     Raises:
         UserError: where another process runs it; the caller puts the stage's name before the line.
     """
-    if not _main_process():
-        yield
-        return
     (RUNS / "locks").mkdir(parents=True, exist_ok=True)
     try:
         with FileLock(RUNS / "locks" / f"{name}.lock", timeout=0):

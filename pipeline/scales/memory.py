@@ -191,15 +191,11 @@ def launched(launcher: str) -> tuple[int, bool]:
     parser.add_argument("--num_processes", "--num-processes", type=int)
     try:
         given, _ = parser.parse_known_args(shlex.split(launcher))
-    except (argparse.ArgumentError, ValueError) as error:
-        raise UserError(f"runtime.launcher: {error}") from None
-    try:
         settings = yaml.safe_load(given.config_file.read_text(encoding="utf-8")) if given.config_file else {}
         return given.num_processes or int(settings.get("num_processes", 1)), settings.get("distributed_type") == "FSDP"
-    except (OSError, yaml.YAMLError, AttributeError, TypeError, ValueError):
-        raise UserError(
-            f"runtime.launcher: {given.config_file} is no configuration of accelerate's; name one that is"
-        ) from None
+    except (argparse.ArgumentError, OSError, yaml.YAMLError, AttributeError, TypeError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise UserError(f"runtime.launcher: {launcher}: {reason}; name a configuration of accelerate's") from None
 
 
 def longest(params: Params, catalogue: Catalogue, language: Path) -> tuple[int, int]:
@@ -216,11 +212,8 @@ def longest(params: Params, catalogue: Catalogue, language: Path) -> tuple[int, 
     questions = build_questions(
         Pool(Part.TRAIN, catalogue, {o: [f"{o}_0"] for o in catalogue.objects}),
         {t: min(n, ASKED) for part in ("train", "evaluation") for t, n in counts_by_task(config, part).items() if n},
-        seed=config.seed,
         distinct=False,
-        facts=config.facts,
-        restate=config.restate,
-        two_turns=config.two_turns,
+        **config.model_dump(include={"seed", "facts", "restate", "two_turns"}),
     )
     for question, turns in ((q, d.turns) for q in questions for d in q.dialogues if d.opd in params.ablation.opd):
         shown = [f"USER: {turn.user} ASSISTANT: {turn.assistant}" for turn in turns]

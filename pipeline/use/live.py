@@ -15,7 +15,7 @@ from pipeline.running.errors import UserError
 from pipeline.use.model import with_marks
 from pipeline.videos.audit.files import FOUND
 from pipeline.videos.frames.reference import LONGEST, contact_strength, mean, starts_touching
-from pipeline.videos.importing.presses import RELEASED, SHORTEST, Shot, begins_at, film
+from pipeline.videos.importing.presses import SHORTEST, Contact, Shot, begins_at, film
 
 if TYPE_CHECKING:
     from pipeline.use.model import Octopi
@@ -64,18 +64,18 @@ def presses(shots: Iterable[Shot], times: float = FOUND) -> Iterator[list[Shot]]
     """Each press as soon as it ends, with up to `LONGEST` untouched pictures in front, which the model compares it to.
 
     A press begins where the contact strength is more than `times` the quiet level (the median of untouched pictures),
-    and ends when it has stayed under `RELEASED` of that for `SHORTEST` pictures. The reference is the mean of pictures
-    a little older than the latest ones: it follows slow changes of the light, and does not yet contain a press that
-    begins. A press that deepens over seconds is also taken for a change of the light, and its release then looks like a
-    press. `starts_touching` recognises such a release by its loss of detail, and it is dropped.
+    and ends as in a recording (`Contact`). A recording's quiet level and reference are of all its pictures; here the
+    reference is the mean of pictures a little older than the latest ones: it follows slow changes of the light, and
+    does not yet contain a press that begins. A press that deepens over seconds is also taken for a change of the light,
+    and its release then looks like a press. `starts_touching` recognises such a release by its loss of detail, and it
+    is dropped.
 
     Raises:
         UserError: as `shots` raises it, after the press that had begun.
     """
     before = deque[tuple[Shot, np.ndarray]](maxlen=2 * LONGEST)
     quiet = deque[float](maxlen=QUIET)
-    press: list[Shot] = []
-    touched = behind = 0
+    press, contact = list[Shot](), Contact()
     first, recent = np.zeros((1, 1, 3), np.uint8), deque[np.ndarray](maxlen=LONGEST)
     gone: UserError | None = None
     try:
@@ -95,19 +95,18 @@ def presses(shots: Iterable[Shot], times: float = FOUND) -> Iterator[list[Shot]]
                 first = mean([old for _, old in list(before)[:LONGEST]])
             press.append(shot)
             recent.append(thumb)
-            held = strength > RELEASED * threshold
-            touched, behind = touched + held, 0 if held else behind + 1
-            released = touched == LONGEST and starts_touching(first, mean(recent))
-            if behind == SHORTEST or len(press) == MOST or released:
+            over = contact.over(strength, threshold)
+            released = contact.touched == LONGEST and starts_touching(first, mean(recent))
+            if over or len(press) == MOST or released:
                 if released or len(press) == MOST:
                     before.clear()
                     quiet.clear()
-                elif touched >= SHORTEST:
+                elif contact.touched >= SHORTEST:
                     yield press
-                press, touched, behind = [], 0, 0
+                press, contact = [], Contact()
     except UserError as error:  # A press that the camera's failure cut off is still yielded.
         gone = error
-    if touched >= SHORTEST:
+    if contact.touched >= SHORTEST:
         yield press
     if gone:
         raise gone

@@ -19,6 +19,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 
 import av
@@ -42,9 +43,11 @@ class Gate:
     """
 
     def __init__(self, seconds: int = 20, spare_bytes: int = 1 << 30) -> None:
-        self.seconds, self.spare_bytes = seconds, spare_bytes
-        self._lock = threading.Lock()
-        self._pool = self._new_pool()
+        self.seconds = seconds
+        # A fork would have the model's memory, and its threads' locks.
+        fresh = multiprocessing.get_context("spawn")
+        self._new = partial(ProcessPoolExecutor, 1, fresh, _restrict, (os.getpid(), spare_bytes))
+        self._pool, self._lock = self._new(), threading.Lock()
 
     @contextmanager
     def files(self, videos: Sequence[bytes]) -> Iterator[list[Path]]:
@@ -57,31 +60,25 @@ class Gate:
             paths = [Path(folder, f"video{n}{SUFFIX.get(data[:4], '.mov')}") for n, data in enumerate(videos, 1)]
             for path, data in zip(paths, videos, strict=True):
                 path.write_bytes(data)
-                self._check(path)
+                with self._lock:  # One at a time, since a pool breaks for all that it was given.
+                    try:
+                        frames = self._pool.submit(count_frames, path, self.seconds).result()
+                    except BrokenProcessPool:
+                        self._pool.shutdown()
+                        self._pool = self._new()
+                        line = f"{path}: takes too long or too much memory to decode; send a shorter or smaller one"
+                        raise UserError(line) from None
+                if not frames:
+                    raise UserError(f"{path}: no frame of it decodes; send one of {', '.join(SUFFIXES)}")
             yield paths
 
     def close(self) -> None:
         """End the checking process."""
         self._pool.shutdown()
 
-    def _new_pool(self) -> ProcessPoolExecutor:
-        # A fork would have the model's memory, and its threads' locks.
-        fresh = multiprocessing.get_context("spawn")
-        return ProcessPoolExecutor(1, fresh, _restrict, (os.getpid(), self.spare_bytes))
 
-    def _check(self, path: Path) -> None:
-        with self._lock:  # One at a time, since a pool breaks for all that it was given.
-            try:
-                self._pool.submit(check, path, self.seconds).result()
-            except (BrokenProcessPool, MemoryError):
-                self._pool.shutdown()
-                self._pool = self._new_pool()
-                message = f"{path}: takes too long or too much memory to decode; send a shorter or smaller one"
-                raise UserError(message) from None
-
-
-def check(path: Path, seconds: int) -> None:
-    """Decode a video whole; UserError where it is none, MemoryError where it takes too much."""
+def count_frames(path: Path, seconds: int) -> int:
+    """Decode a video whole; end this process where that takes too long, or more memory than there is."""
     # Nothing handles the alarm, so it ends this process, in the middle of a decoder if need be.
     signal.alarm(seconds)
     frames = 0
@@ -97,12 +94,11 @@ def check(path: Path, seconds: int) -> None:
                 except (av.FFmpegError, ValueError):
                     continue  # What is damaged is left out, as players do.
     except MemoryError:
-        raise MemoryError from None
+        os._exit(1)
     except (av.FFmpegError, ValueError):
         pass
     signal.alarm(0)
-    if not frames:
-        raise UserError(f"{path}: no frame of it decodes; send one of {', '.join(SUFFIXES)}")
+    return frames
 
 
 def _restrict(parent: int, spare_bytes: int) -> None:

@@ -65,19 +65,6 @@ def read_token(file: Path | None) -> str:
     return token
 
 
-async def _read(request: Request) -> bytes:
-    """The body of a request."""
-    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
-        # A page of another site may send other types without asking the browser's leave.
-        raise HTTPException(415, "send Content-Type: application/json")
-    data = bytearray()
-    async for chunk in request.stream():
-        data += chunk
-        if len(data) > MOST_BYTES:
-            raise HTTPException(413, f"the request is larger than {MOST_BYTES} bytes; send fewer or shorter videos")
-    return bytes(data)
-
-
 async def _events(reply: Reply, first: str, pieces: AsyncGenerator[str]) -> AsyncIterator[str]:
     """Server-sent events as OpenAI sends them; an error that comes late is the last event."""
 
@@ -90,25 +77,21 @@ async def _events(reply: Reply, first: str, pieces: AsyncGenerator[str]) -> Asyn
             yield event(reply.chunk({"content": first}))
             async for piece in pieces:
                 yield event(reply.chunk({"content": piece}))
-            yield event(reply.chunk({}, "stop"))
-            yield "data: [DONE]\n\n"
+            yield event(reply.chunk({}, "stop")) + "data: [DONE]\n\n"
         except (UserError, Failed) as error:
             yield event(_error(error)[0])
 
 
 def _error(error: Exception) -> tuple[Json, int]:
     """An error in OpenAI's form, of one line, and its status."""
+    message, status = str(Failed()), 500
     if isinstance(error, HTTPException):
         message, status = str(error.detail), error.status_code
     elif isinstance(error, UserError):
-        message, status = str(error), 422
-    else:
-        message, status = str(Failed()), 500
-    kinds = {401: "authentication_error", 404: "not_found_error", 429: "rate_limit_error", 500: "server_error"}
-    # Videos lie in a folder of ours, whose name is nobody's business.
-    message = PLACE.sub(r"video \1", " ".join(message.split()))
-    told = {"message": message, "type": kinds.get(status, "invalid_request_error"), "param": None, "code": None}
-    return {"error": told}, status
+        # Videos lie in a folder of ours, whose name is nobody's business.
+        message, status = PLACE.sub(r"video \1", " ".join(str(error).split())), 422
+    kind = "server_error" if status == 500 else "invalid_request_error"
+    return {"error": {"message": message, "type": kind, "param": None, "code": None}}, status
 
 
 def make_app(model: Octopi, name: str, *, token: str = "", places: int = 32) -> FastAPI:
@@ -120,8 +103,7 @@ def make_app(model: Octopi, name: str, *, token: str = "", places: int = 32) -> 
         token: What they must send; empty for none, and then only names of this machine are answered to.
         places: Requests at once, from the first byte to the answer; the next gets 429.
     """
-    gate, worker = Gate(), Worker()
-    taken = 0
+    gate, worker, taken = Gate(), Worker(), 0
     entry = {"id": name, "object": "model", "created": int(time.time()), "owned_by": "octopi-pipeline"}
 
     @asynccontextmanager
@@ -168,7 +150,15 @@ def make_app(model: Octopi, name: str, *, token: str = "", places: int = 32) -> 
 
     @app.post("/v1/chat/completions", dependencies=guarded)
     async def chat(request: Request, stack: ExitStack = place) -> Response:
-        wanted = await asyncio.to_thread(read_request, await _read(request))
+        if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
+            # A page of another site may send other types without asking the browser's leave.
+            raise HTTPException(415, "send Content-Type: application/json")
+        data = bytearray()
+        async for chunk in request.stream():
+            data += chunk
+            if len(data) > MOST_BYTES:
+                raise HTTPException(413, f"a request has at most {MOST_BYTES} bytes; send fewer or shorter videos")
+        wanted = await asyncio.to_thread(read_request, bytes(data))
         check_name(wanted.model)
         said, reply = read_conversation(wanted.messages), Reply(name)
         # The conversation's videos are files until the stack is closed.

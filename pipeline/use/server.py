@@ -19,8 +19,6 @@ from pipeline.running.errors import UserError
 
 logger = logging.getLogger(__name__)
 
-TOGETHER = 32
-"""Most questions that are begun at once; the model divides them by its own batch size."""
 PAUSE = 0.05
 """Seconds without a new question after which a batch is begun. Clients that were answered together ask again within
 moments of each other: without a pause the first of them would be answered alone, and the others wait for that."""
@@ -60,7 +58,10 @@ class Job:
 
 
 class Worker:
-    """The thread that holds the model: what waits is answered in one batch, and what comes meanwhile in the next."""
+    """The thread that holds the model: what waits is answered in one batch, and what comes meanwhile in the next.
+
+    The model divides a batch by its own batch size.
+    """
 
     def __init__(self) -> None:
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
@@ -92,11 +93,9 @@ class Worker:
         while (job := self._jobs.get()) is not None:
             jobs = [job]
             with suppress(queue.Empty):
-                while len(jobs) < TOGETHER:
-                    if (job := self._jobs.get(timeout=PAUSE)) is None:
-                        self._jobs.put(None)  # It ends the loop when these are answered.
-                        break
+                while (job := self._jobs.get(timeout=PAUSE)) is not None:
                     jobs.append(job)
+                self._jobs.put(None)  # It ends the loop when these are answered.
             self._answer(jobs)
 
     def _answer(self, jobs: Sequence[Job]) -> None:

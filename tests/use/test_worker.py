@@ -7,7 +7,6 @@ import threading
 from collections.abc import AsyncGenerator, Collection, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -78,8 +77,7 @@ def test_what_waits_is_one_batch_and_each_answer_is_the_one_given_alone(
 def test_who_asks_moments_later_is_in_the_same_batch(
     octopi: Octopi, files: list[Path], batches: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.use.server.PAUSE", HUNG)
-    monkeypatch.setattr("pipeline.use.server.TOGETHER", 2)
+    monkeypatch.setattr("pipeline.use.server.PAUSE", 5.0)
 
     async def ask() -> None:
         worker, found = Worker(), []
@@ -107,27 +105,3 @@ def test_a_batch_that_breaks_fails_each_of_its_questions(
 
     monkeypatch.setattr("pipeline.language.generate.greedy_tokens", lambda *_: iter([1 / 0]))
     assert asyncio.run(ask()) == [Failed] * 3 + [octopi.ask("Why?", files[:1]).strip()]
-
-
-def test_who_leaves_at_the_last_piece_leaves_the_others_their_answers() -> None:
-    leaves = threading.Event()
-
-    def together(streams: Sequence[Any], left: Collection[int]) -> Iterator[tuple[int, str | None]]:
-        yield 0, "last"
-        assert leaves.wait(HUNG)
-        yield from [(0, None), (1, "one"), (1, None)]
-
-    async def ask() -> str:
-        worker, gate = Worker(), threading.Event()
-        blocker = worker.answer(lambda: [gate.wait(HUNG)])  # Until both wait, so that they are one batch.
-        gone, stays = (worker.answer(lambda: SimpleNamespace(together=together)) for _ in range(2))
-        gate.set()
-        assert await anext(blocker)
-        assert await anext(gone) == "last"
-        await gone.aclose()
-        leaves.set()
-        said = await everything(stays)
-        await asyncio.to_thread(worker.stop)
-        return said
-
-    assert asyncio.run(ask()) == "one"

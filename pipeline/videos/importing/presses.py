@@ -20,7 +20,6 @@ import av
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
 
 from pipeline.core.io import remove_rests, write_csv
 from pipeline.core.records import Record
@@ -253,20 +252,34 @@ def read_picture(data: npt.NDArray[np.uint8], where: str) -> Image | None:
     return None if picture is None else picture.astype(np.uint8)
 
 
+class Contact:
+    """A press, picture by picture: over when `SHORTEST` of them in a row lie under `RELEASED` of what it begins at."""
+
+    touched = behind = 0
+    """Pictures that lie over it, and those since the last of them."""
+
+    def over(self, strength: float, threshold: float) -> bool:
+        """Take in the next picture; whether the press is over with it."""
+        held = strength > RELEASED * threshold
+        self.touched, self.behind = self.touched + held, 0 if held else self.behind + 1
+        return self.behind == SHORTEST
+
+
 def presses(strengths: npt.NDArray[np.float64], times: float = FOUND) -> list[tuple[int, int]]:
     """Where something touches: (first frame, one behind the last), rising, none overlapping.
 
-    Hysteresis: a press reaches `times` the quiet level, and lasts while strengths (by frame, in 8-bit steps) lie over
-    `RELEASED` of that. Each is widened on both sides by up to `LONGEST` untouched frames, which the chain takes its
-    reference from, but not beyond the middle to its neighbour.
+    A press begins over `times` the quiet level; strengths are by frame, in 8-bit steps. Each is widened on both sides
+    by up to `LONGEST` untouched frames, which the chain takes its reference from, but not beyond the middle to its
+    neighbour.
     """
-    threshold = _threshold(strengths, times)
-    labels, _ = ndimage.label(strengths > RELEASED * threshold)
-    found = [
-        (place.start, place.stop)
-        for (place,) in ndimage.find_objects(labels)
-        if place.stop - place.start >= SHORTEST and strengths[place].max() > threshold
-    ]
+    threshold, begin, contact, found = _threshold(strengths, times), 0, Contact(), list[tuple[int, int]]()
+    for place, strength in enumerate([*strengths, *[0.0] * SHORTEST]):  # What lasts to the end is over behind it.
+        if not contact.touched:
+            begin = place
+        if (contact.touched or strength > threshold) and contact.over(strength, threshold):
+            if contact.touched >= SHORTEST:
+                found.append((begin, place + 1 - SHORTEST))
+            contact = Contact()
     if not found:
         return []
     middles = [0, *((a[1] + b[0]) // 2 for a, b in itertools.pairwise(found)), len(strengths)]
