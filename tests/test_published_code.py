@@ -21,7 +21,7 @@ from pipeline.cli import app
 from pipeline.config import EncoderConfig, FramesConfig, LanguageConfig, LoraTrainConfig
 from pipeline.core.records import Turn
 from pipeline.encoder.model import PropertyClassifier
-from pipeline.encoder.release import property_classifier
+from pipeline.encoder.release import property_classifier, sinusoid
 from pipeline.language.chat import IGNORE_INDEX, PIECE, TACTILE, encode, render
 from pipeline.language.generate import reply, write_prompt
 from pipeline.language.lora import add_lora
@@ -96,9 +96,12 @@ def octopi(source: Path) -> Octopi:
 @pytest.fixture
 def classifier(octopi: Octopi, monkeypatch: pytest.MonkeyPatch) -> PropertyClassifier:
     """Given the pictures as CLIP's own processor made them."""
-    made = octopi.encoder._classifier
+    made = octopi.encoder.classifier
     monkeypatch.setattr(type(made.encoder), "pixels", lambda _, pictures: pictures)
     return made
+
+
+# ---- the encoder ----
 
 
 def test_features_and_heads(classifier: PropertyClassifier) -> None:
@@ -112,6 +115,13 @@ def test_features_and_heads(classifier: PropertyClassifier) -> None:
         logits = classifier(frames[None], places[None])["logits"][0].split(3)
         for name, found in zip(PROPERTIES, logits, strict=True):
             close(found, own[name])
+
+
+def test_sinusoid() -> None:
+    """Theirs is computed in float32, and off by up to 1e-5 at late frames."""
+    known = numbers("sinusoid_1024")
+    places, theirs = (known[key] for key in sorted(known, key=lambda key: known[key].ndim))
+    close(sinusoid(places.flatten(), theirs.shape[-1]), theirs.reshape(-1, theirs.shape[-1]), 2e-5)
 
 
 def test_one_step_of_the_encoder(octopi: Octopi, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,6 +157,9 @@ def test_frames_that_are_kept() -> None:
     ((name, known),) = texts("golden/processing.json").items()
     kept = scanned(GOLDEN / "video" / name, FramesConfig(selection="release", pixels=16)).kept
     assert [frame.index + 1 for frame in kept] == known["kept"]
+
+
+# ---- the prompts ----
 
 
 def turn_of(pieces: list[str], answer: str = "") -> Turn:
@@ -207,6 +220,9 @@ def test_labels_cover_answers_alone(octopi: Octopi, single: bool) -> None:
     assert encoded.input_ids[0] == tokenizer.bos_token_id
 
 
+# ---- one step of the language model ----
+
+
 @pytest.mark.parametrize("stage", ["align", "lora"])
 def test_one_step_of_the_language_model(octopi: Octopi, stage: str) -> None:
     known, base = numbers(f"step_{stage}"), octopi.config.base.folder
@@ -256,6 +272,9 @@ def places(known: Numbers) -> dict[str, str]:
     return {adapted.get(n, n.replace("project", "connector.projection")): n for n in theirs}
 
 
+# ---- the converted checkpoint ----
+
+
 @pytest.mark.parametrize("together", [True, False])
 def test_published_tokens(octopi: Octopi, classifier: PropertyClassifier, together: bool) -> None:
     prompts, features, wanted = [], [], []
@@ -291,11 +310,18 @@ def test_without_heads_the_sentence_names_the_classes(octopi: Octopi) -> None:
 
 
 def test_a_wrong_file_is_named(source: Path, octopi: Octopi, tmp_path: Path) -> None:
+    with refused("name it with --base"):
+        bases = ["--base", str(GOLDEN / "base/vicuna"), "--clip", str(GOLDEN / "base/clip"), "--trust-pickle"]
+        arguments = ["weights", "octopi-7b", str(source), *bases, "--to", "models/again"]
+        CliRunner().invoke(app, arguments, catch_exceptions=False)
     with refused("encoder.pt is a pickle"):
         convert(source, to="models/untrusted")
     shutil.copytree(source, tmp_path / "broken")
     cut(tmp_path / "broken/project.pt", 500)
     with refused("project.pt is cut off"):
+        convert(tmp_path / "broken", "--trust-pickle", to="models/broken")
+    (tmp_path / "broken/project.pt").unlink()
+    with refused("project.pt does not exist"):
         convert(tmp_path / "broken", "--trust-pickle", to="models/broken")
     state = torch.load(source / "encoder.pt", weights_only=True)
     del state["model.vision_model.encoder.layers.3.VPT_shallow"]
