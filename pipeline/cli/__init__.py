@@ -522,7 +522,7 @@ def adapt(
     ratings = None if catalogue is None else load_catalogue(catalogue)
     found = {file: "" for file, _ in videos_of(videos)} if ratings is None else rated_videos(videos, ratings)
     told = fit(_load(model, base, device), [*found], out, catalogue=ratings, objects=[*filter(None, found.values())])
-    typer.echo(f"{told}\n{out}: made of {counted(len(found), 'video')}; name it with --model {out}")
+    typer.echo(f"{told}\n{out}: written; name it with --model {out}")
 
 
 @app.command()

@@ -14,7 +14,6 @@ import torch
 
 from pipeline.core.io import atomic_folder, load_tensors, save_tensors, sha256, write_json, write_text
 from pipeline.core.records import Encoder, Part
-from pipeline.encoder.few_ratings import Known, Rated, Reading, on_features, read_anew, standardised
 from pipeline.encoder.frame_classifier import FittedHeads, JointFrameClassifier
 from pipeline.encoder.records import Classification
 from pipeline.evaluation.calibration import fit_temperature
@@ -24,6 +23,7 @@ from pipeline.running.progress import track
 from pipeline.training.card import CARD_FILE
 from pipeline.training.embeddings import STATISTICS_FILE, Statistics
 from pipeline.use.encoding import EncodedVideo
+from pipeline.use.few_ratings import Known, Rated, Reading, on_features, read_anew, standardised
 from pipeline.use.folder import CATALOGUE, CONFIG, ENCODER_DIR, TRAINED, distance
 from pipeline.use.model import Octopi
 from pipeline.videos.catalogue import Catalogue
@@ -80,7 +80,7 @@ def adapt(
     """Copy a model's folder for the sensor of these videos, and say what the copy knows.
 
     Embeddings and the logits of the property heads are standardised by the videos' frames, as another sensor shifts and
-    scales them. With ratings the heads are read anew on the frozen encoder (`pipeline.encoder.few_ratings`). A language
+    scales them. With ratings the heads are read anew on the frozen encoder (`pipeline.use.few_ratings`). A language
     model that reads logits is given the new ones on the scale that it learnt; it is not trained.
 
     Args:

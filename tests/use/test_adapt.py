@@ -11,15 +11,16 @@ import torch
 from scipy.special import log_softmax, logsumexp
 
 from pipeline.core.io import read_json
-from pipeline.encoder.few_ratings import Known, Rated, Way, fit, read_anew, standardised
 from pipeline.use.adapt import adapt, rated_videos
-from pipeline.use.folder import CONFIG, read_folder
+from pipeline.use.few_ratings import Known, Rated, Way, fit, read_anew, standardised
+from pipeline.use.folder import CONFIG, find_base, read_folder
 from pipeline.use.model import Octopi
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from tests.checkpoints import edit
 from tests.closure import ROOT
-from tests.conftest import refused
+from tests.conftest import refused, write_video
 from tests.models import model_folder
+from tests.use.shared import Made
 
 EXAMPLES = ROOT / "examples"
 VIDEOS = [EXAMPLES / f"{name}.mp4" for name in ("soft", "hard", "rough")]
@@ -137,3 +138,19 @@ def test_what_cannot_be_adapted(octopi: Octopi, catalogue: Catalogue, tmp_path: 
     with refused("name the folder of videos"):
         rated_videos(VIDEOS[:1], catalogue)
     assert not (tmp_path / "mine").exists()
+
+
+def test_heads_of_another_recipe_stay(
+    made: Made, files: list[Path], catalogue: Catalogue, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """And a video in which nothing is touched is left out, with a line."""
+    model = Octopi.from_pretrained(made.folder, device="cpu")
+    with refused("heads are read anew where it has been fine-tuned with encoder.recipe=tuned"):
+        adapt(model, files, tmp_path / "mine", catalogue=catalogue, objects=["rug", "pillow"])
+    still = write_video(tmp_path / "still.avi", np.full((12, 48, 64, 3), 120, np.uint8))
+    told = adapt(model, [*files, still], tmp_path / "mine")
+    assert f"standardised by {len(files)} videos" in told
+    assert "still.avi: left out, nothing touches the sensor" in caplog.text
+    base, _ = find_base(made.folder, model.config.base)
+    mine = Octopi.from_pretrained(tmp_path / "mine", base=base, device="cpu")
+    assert mine.encoder.classify(files[0]) == model.encoder.classify(files[0])
