@@ -1,6 +1,7 @@
 """Ask trained models about this run's videos, whose objects are new to them."""
 
 from collections import Counter
+from itertools import product
 
 from pipeline.core.io import read_table, write_table
 from pipeline.core.layout import EVALUATED, SHIPPED, VIDEOS, split_file
@@ -12,7 +13,7 @@ from pipeline.videos.records import Assignment, Video
 
 if __name__ == "__main__":
     with stage("evaluate") as run:
-        from pipeline.use.evaluate import answers_about
+        from pipeline.use.evaluate import answers_about, answers_after_ratings
         from pipeline.use.model import Octopi
 
         params, graded = run.params, list[GradedVision]()
@@ -23,13 +24,16 @@ if __name__ == "__main__":
             # As many on every machine, since sums depend on how they are shared out.
             limit_threads(2)
         # With folds each object is a test object of one of them.
-        assigned = [a for seed in params.ablation.seeds for a in read_table(split_file(seed), Assignment)]
-        parts = {a.object_id: a.part for a in sorted(assigned, key=lambda a: a.part == "test")}
+        splits = {seed: read_table(split_file(seed), Assignment) for seed in params.ablation.seeds}
+        assigned = sorted((a for split in splits.values() for a in split), key=lambda a: a.part == "test")
+        parts, videos = {a.object_id: a.part for a in assigned}, read_table(VIDEOS, Video)
         for folder in params.evaluate.models:
             place = SHIPPED if folder == SHIPPED.name else folder
             # Half precision on one processor and not on another would make the report depend on the machine.
             octopi = Octopi.from_pretrained(place, device=params.runtime.device, dtype=params.language.dtype)
-            graded += answers_about(octopi, params, read_table(VIDEOS, Video), parts)
+            graded += answers_about(octopi, params, videos, parts)
+            for count, (seed, split) in product(params.evaluate.rated, splits.items()):
+                graded += answers_after_ratings(octopi, params, videos, split, seed, count)
         run.metrics["answers"] = len(
             {(g.model, g.shown, g.question_id) for g in graded if g.shown is not Shown.CLASSES}
         )

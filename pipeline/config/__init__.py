@@ -395,6 +395,9 @@ class EvaluateConfig(Section):
     """How many, half of them descriptions; 0: as many as questions.evaluation says."""
     repeats: Positive = 1
     """Sets of questions about the same objects, to see how far accuracy moves from set to set."""
+    rated: tuple[Annotated[Whole, Field(ge=0)], ...] = ()
+    """Learning curve: each model also answers after `octopi adapt` by so many of the training objects, with ratings (0:
+    by videos alone). For each seed, it answers the chain's own questions about test objects."""
 
 
 class TrackingConfig(Section):

@@ -14,6 +14,10 @@ Share = Annotated[float, AfterValidator(lambda value: round(value, 6))]
 """A figure of a report."""
 
 
+ADAPTED = ", adapted by "
+"""Between a model's name and the number of rated objects that it was adapted by (`evaluate.rated`)."""
+
+
 class Shown(StrEnum):
     """What a model that the chain did not train is shown."""
 

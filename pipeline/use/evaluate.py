@@ -1,28 +1,35 @@
-"""Evaluation of trained models on a run's videos, whose objects they were not trained on."""
+"""Evaluation of trained models on a run's videos, whose objects they were not trained on.
+
+They answer as they are, and after `octopi adapt` by a few objects: the learning curve of another sensor.
+"""
 
 from __future__ import annotations
 
 import logging
+import random
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import torch
 
 from pipeline.config import Params
 from pipeline.core.layout import SHIPPED
-from pipeline.core.records import Part
+from pipeline.core.records import Part, Question
+from pipeline.core.runtime import derive_seed
 from pipeline.encoder.records import Classification
 from pipeline.evaluation.grading import conclude, grade
-from pipeline.evaluation.records import GradedVision, Shown
+from pipeline.evaluation.records import ADAPTED, GradedVision, Shown
 from pipeline.language.generate import answer
 from pipeline.running.errors import UserError
 from pipeline.running.progress import track
 from pipeline.tasks.base import Pool
-from pipeline.tasks.questions import build_questions, counts_by_task
+from pipeline.tasks.questions import build_questions, counts_by_task, pool_of
 from pipeline.training.embeddings import EmbeddingStore
+from pipeline.use.adapt import adapt
 from pipeline.use.model import Octopi
 from pipeline.videos.catalogue import Catalogue, load_catalogue
-from pipeline.videos.records import Video
+from pipeline.videos.records import Assignment, Video
 
 logger = logging.getLogger(__name__)
 
@@ -47,14 +54,7 @@ def answers_about(
         UserError: for an object that the model was trained on, or a video that it cannot use.
     """
     config = params.evaluate
-    catalogue = load_catalogue(Path(params.data.catalogue)).asking(params.questions.scenarios)
-    catalogue = catalogue.called("number" if octopi.numbered else "catalogue")
-    known, wanted = (
-        "; ".join(f"{name}: {', '.join(levels)}" for name, levels in c.classes.items())
-        for c in (octopi.catalogue, catalogue)
-    )
-    if known != wanted:
-        logger.warning("%s is not asked: it knows %s, but %s has %s", octopi.name, known, params.data.catalogue, wanted)
+    if (catalogue := _asking(octopi, params)) is None:
         return []
     videos = [v for v in videos if config.objects == "all" or parts.get(v.object_id) is Part.TEST]
     of_object: dict[str, list[str]] = {}
@@ -74,19 +74,96 @@ def answers_about(
     for repeat in range(config.repeats):
         pool, seed = Pool(Part.TEST, catalogue, of_object), params.questions.seed + repeat
         drawn = build_questions(pool, counts, seed=seed, distinct=True, facts=octopi.config.facts)
-        asked[repeat] = [
+        asked[params.ablation.seeds[0] + repeat] = [
             q.model_copy(update={"question_id": f"{q.question_id}-{repeat}"}) if repeat else q for q in drawn
         ]
+    standardised = params.data.source == "videos" and octopi.config.encoder.standardize
+    return _graded(octopi, octopi.name, params, catalogue, videos, asked, standardised=standardised)
+
+
+def answers_after_ratings(
+    octopi: Octopi, params: Params, videos: Sequence[Video], assigned: Sequence[Assignment], seed: int, count: int
+) -> list[GradedVision]:
+    """Adapt a model by `count` training objects of one split, and ask it the chain's questions about its test objects.
+
+    Larger counts have the objects of smaller ones, and more.
+
+    Args:
+        assigned: The split of this seed.
+        count: 0 adapts by the videos of all training objects, without their ratings.
+
+    Raises:
+        UserError: where the split has fewer training objects, or as `adapt` has it.
+    """
+    if (catalogue := _asking(octopi, params)) is None:
+        return []
+    folder, rated = Path(params.data.dir), load_catalogue(Path(params.data.catalogue))
+    names = sorted({a.object_id for a in assigned if a.part is Part.TRAIN})
+    if count > len(names):
+        raise UserError(
+            f"evaluate.rated: {count} objects, but seed {seed} trains on {len(names)}; name at most as many"
+        )
+    random.Random(derive_seed(seed, "rated")).shuffle(names)
+    own = [v for v in videos if v.object_id in names[: count or None]]
+    tested = {a.video_id for a in assigned if a.part is Part.TEST}
+    split = params.split
+    questions = build_questions(
+        pool_of(Part.TEST, assigned, catalogue),
+        counts_by_task(params.questions, "evaluation"),
+        seed=params.questions.seed,
+        distinct=True,
+        facts=octopi.config.facts,
+        restate=params.questions.restate,
+        fold=split.fold_of(seed),
+    )
+    with TemporaryDirectory() as place:
+        to = Path(place) / "adapted"
+        whose = [v.object_id for v in own]
+        adapt(octopi, [folder / v.path for v in own], to, catalogue=rated if count else None, objects=whose, seed=seed)
+        adapted = Octopi.from_pretrained(to, device=params.runtime.device, dtype=params.language.dtype)
+        about, asked = [v for v in videos if v.video_id in tested], {split.replicate_of(seed): questions}
+        return _graded(adapted, after_ratings(octopi.name, count), params, catalogue, about, asked)
+
+
+def after_ratings(model: str, count: int) -> str:
+    """What a report calls a model that was adapted by so many rated objects."""
+    return f"{model}{ADAPTED}{count}"
+
+
+def _asking(octopi: Octopi, params: Params) -> Catalogue | None:
+    """The run's objects as the model is asked about them; None, with a warning, where it knows other classes."""
+    catalogue = load_catalogue(Path(params.data.catalogue)).asking(params.questions.scenarios)
+    known, wanted = (
+        "; ".join(f"{name}: {', '.join(levels)}" for name, levels in c.classes.items())
+        for c in (octopi.catalogue, catalogue)
+    )
+    if known != wanted:
+        logger.warning("%s is not asked: it knows %s, but %s has %s", octopi.name, known, params.data.catalogue, wanted)
+        return None
+    return catalogue.called("number" if octopi.numbered else "catalogue")
+
+
+def _graded(
+    octopi: Octopi,
+    name: str,
+    params: Params,
+    catalogue: Catalogue,
+    videos: Sequence[Video],
+    asked: Mapping[int, Sequence[Question]],
+    *,
+    standardised: bool = False,
+) -> list[GradedVision]:
+    """Answers about videos, graded; by the seed under which a report counts them."""
     touches, rows, classified = touched(octopi, catalogue, Path(params.data.dir), videos)
     ways = {Shown.TOUCH: touches}
-    if params.data.source == "videos" and octopi.config.encoder.standardize:
+    if standardised:
         std, mean = torch.std_mean(touches, dim=0, correction=0)
         ways[Shown.STANDARDISED] = (touches - mean) / torch.where(std > 0, std, 1.0)  # As `adapt` does.
     language, per_video = octopi.config.language, octopi.config.frames.per_video
-    if octopi.folder == SHIPPED:
+    if name.partition(ADAPTED)[0] == SHIPPED.name:
         language = language.model_copy(update={"generation_batch_size": BATCH})
     found = []
-    for repeat, questions in asked.items():
+    for seed, questions in asked.items():
         scored = {}
         for shown, features in ways.items():
             store = EmbeddingStore().with_rows(rows, features)
@@ -95,12 +172,7 @@ def answers_about(
         if octopi.config.heads:
             scored[Shown.CLASSES] = conclude(questions, classified, catalogue)
         for shown, scores in scored.items():
-            found += [
-                GradedVision(
-                    **score.model_dump(), model=octopi.name, shown=shown, seed=params.ablation.seeds[0] + repeat
-                )
-                for score in scores
-            ]
+            found += [GradedVision(**score.model_dump(), model=name, shown=shown, seed=seed) for score in scores]
     return found
 
 
