@@ -19,7 +19,7 @@ from pipeline.core.records import Encoder, Lora, Opd, Part, Touch
 from pipeline.encoder.records import Classification
 from pipeline.evaluation.intervals import Objects, accuracy_interval
 from pipeline.evaluation.paired import Difference, paired
-from pipeline.evaluation.records import Graded, GradedVision
+from pipeline.evaluation.records import ADAPTED, Graded, GradedVision, Shown
 from pipeline.evaluation.rows import ALL_SEEDS, HEADS, RECALL, VALIDATION_HEADS, EffectRow, ScoreRow
 from pipeline.tasks import TASKS
 from pipeline.tasks.records import Score
@@ -83,7 +83,7 @@ def score_rows(
         vision: Graded answers of vision-only models.
         concluded: By seed, the scores that `pipeline.evaluation.grading.conclude` gives.
     """
-    seen = _tabled(_entry(g, Setting(g.model, opd=Opd.ALL, touch=g.shown), g.seed) for g in vision)
+    seen = _other(vision)
     chances, rows = {name: task.chance(catalogue) for name, task in TASKS.items()}, []
     for table in (_answers(graded, catalogue, concluded or {}), seen, _heads(classifications or {}, catalogue)):
         for (task, measure), settings in table.items():
@@ -95,20 +95,33 @@ def score_rows(
 
 
 def effect_rows(
-    graded: Iterable[Graded], catalogue: Catalogue, concluded: Mapping[int, Sequence[Score]] | None = None
+    graded: Iterable[Graded],
+    catalogue: Catalogue,
+    concluded: Mapping[int, Sequence[Score]] | None = None,
+    vision: Iterable[GradedVision] = (),
 ) -> list[EffectRow]:
     """The rows of effects.csv: what each part of the full system brings, task by task, pooled over seeds.
 
     Only each task's measure of a whole answer, on questions and seeds that both settings have. Holm's adjustment is
-    over all rows. Arguments are as `score_rows` takes them.
+    over all rows. Arguments are as `score_rows` takes them. Training stands beside each model as it is adapted by the
+    most rated objects.
     """
-    rows = []
-    table = _answers(graded, catalogue, concluded or {})
-    for part, full, less in CHANGES:
+    rows, table, other = [], _answers(graded, catalogue, concluded or {}), _other(vision)
+    counts = defaultdict[str, set[int]](set)
+    for setting in {setting for settings in other.values() for setting in settings}:
+        name, adapted, count = setting.encoder.partition(ADAPTED)
+        if adapted and setting.touch == Shown.TOUCH:
+            counts[name].add(int(count))
+    most = {name: Setting(f"{name}{ADAPTED}{max(counts[name])}", opd=Opd.ALL, touch=Shown.TOUCH) for name in counts}
+    for part, full, less in (*CHANGES, *(("training", FULL, most[name]) for name in sorted(most))):
         for (task, measure), settings in table.items():
-            if measure == TASKS[task].measure and (gap := difference(settings.get(full, {}), settings.get(less, {}))):
-                change = "full system - heads and rules"
-                if less is not RULES:
+            beside = {**settings, **other.get((task, measure), {})}
+            if measure == TASKS[task].measure and (gap := difference(beside.get(full, {}), beside.get(less, {}))):
+                if less is RULES:
+                    change = "full system - heads and rules"
+                elif part == "training":
+                    change = f"full system - {less.encoder} rated objects"
+                else:
                     change = f"{getattr(full, part)} - {getattr(less, part)}"
                 rows.append(EffectRow(part=part, change=change, task=task, measure=measure, **vars(gap)))
     return with_holm(rows)
@@ -163,6 +176,11 @@ def _rows(runs: Runs, *, chance: float, **named: str) -> list[ScoreRow]:
         )
         rows.append(row)
     return rows
+
+
+def _other(vision: Iterable[GradedVision]) -> Table:
+    """Answers of models that the chain did not train."""
+    return _tabled(_entry(g, Setting(g.model, opd=Opd.ALL, touch=g.shown), g.seed) for g in vision)
 
 
 def grouped(graded: Iterable[Graded], order: Iterable[tuple[str, str]] = (), ruled: Iterable[Entry] = ()) -> Table:

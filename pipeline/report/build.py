@@ -83,7 +83,7 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     sources = vision_models(root / layout.EXTERNAL / params.report_name).values()
     origin["vision"] = [s.model_dump(mode="json") for s in sources if (s.model, s.shown) in rated]
     write_csv(folder / "scores.csv", ScoreRow, score_rows(graded, catalogue, pooled, vision, concluded))
-    write_csv(folder / "effects.csv", EffectRow, effect_rows(graded, catalogue, concluded))
+    write_csv(folder / "effects.csv", EffectRow, effect_rows(graded, catalogue, concluded, vision))
     write_csv(folder / "calibration.csv", CalibrationRow, calibration_rows(list(by_encoder.values())))
     audit = root / layout.AUDIT / "audit.csv"
     write_csv(folder / "audit.csv", Finding, read_csv(audit, Finding) if audit.is_file() else [])

@@ -18,6 +18,7 @@ from sklearn.metrics import ConfusionMatrixDisplay
 from pipeline.core.io import atomic
 from pipeline.report.load import Report
 from pipeline.report.render import WORDS
+from pipeline.report.tables import marked, ordered, over_seeds, system
 
 MEASURED, QUIET, LINE, TEXT = "#0a5fb4", "#555b66", "#c9ced6", "#1a1d23"
 SERIES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#000000")
@@ -51,6 +52,8 @@ def draw_figures(report: Report) -> list[str]:
     maps = pd.read_csv(report.folder / "map.csv", dtype=words, keep_default_na=False)
     drawn: dict[str, Figure] = {}
     with rc_context(STYLE):
+        if len(learnt := marked(over_seeds(report.scores)).query("whole and rated.notna()")):
+            drawn["ratings.png"] = draw_ratings(learnt)
         if len(effects):
             drawn["effects.png"] = draw_effects(effects)
         if len(confusion):
@@ -89,6 +92,25 @@ def draw_effects(effects: pd.DataFrame) -> Figure:
         axes.set_title(f"{WORDS['parts'].get(part, part)}\n{change}")
         axes.set_yticks([-i for i in range(len(labels))], names if number % 4 == 0 else [""] * len(labels))
         axes.grid(axis="x")
+    return figure
+
+
+def draw_ratings(learnt: pd.DataFrame) -> Figure:
+    """The learning curve: a panel a task, accuracy with its interval by rated objects, a line a system, and chance."""
+    panels = ordered(learnt).groupby("task", sort=False)
+    places = {count: place for place, count in enumerate(sorted(learnt["rated"].unique()))}
+    figure, axes = _panels(len(panels), 2.7, 2.6)
+    for own, (task, rows) in zip(axes, panels, strict=True):
+        names = rows.assign(system=[system(row) for row in rows.to_dict("records")]).groupby("system", sort=False)
+        for number, (name, line) in enumerate(names):
+            x = line["rated"].map(places) + 0.08 * number
+            spans = 100 * abs(line[["low", "high"]].sub(line["accuracy"], axis=0).T.to_numpy())
+            own.errorbar(x, 100 * line["accuracy"], spans, fmt="o-", color=SERIES[number % len(SERIES)], label=name)
+        own.axhline(100 * rows["chance"].iloc[0], color=QUIET, linewidth=0.9, linestyle=":", label="chance")
+        own.set(title=task, ylim=(0, 100), xlabel="rated objects", ylabel="right, %" if own is axes[0] else "")
+        own.set_xticks([*places.values()], [f"{count:.0f}" for count in places])
+        own.grid(axis="y")
+    axes[0].legend(loc="upper left")
     return figure
 
 

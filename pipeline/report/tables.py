@@ -15,7 +15,7 @@ import pandas as pd
 import yaml
 
 from pipeline.core.records import Touch
-from pipeline.evaluation.records import Shown
+from pipeline.evaluation.records import ADAPTED, Shown
 from pipeline.evaluation.rows import ALL_SEEDS, HEADS, RECALL, VALIDATION_HEADS
 from pipeline.report.load import DATASET, DATASETS, KEYS, Report, published
 from pipeline.report.render import WORDS, Block
@@ -78,7 +78,8 @@ def marked(scores: pd.DataFrame) -> pd.DataFrame:
     `by` says what answered: the language model given real touch (`model`) or an input ablation (`other touch`), `rules`
     on the heads' classes, the `shipped` model, a `vision`-only model, or the task's name where nothing was answered.
     `lacks` names the axes on which a variant differs from the full system, or `needed` for that OPD mode, which the
-    paper's tables lack. `whole`: whether the measure is about the whole answer; `trained`: whether the task is trained.
+    paper's tables lack. `whole`: whether the measure is about the whole answer; `trained`: whether the task is trained;
+    `rated`: by how many rated objects a model was adapted, NaN where none was.
     """
 
     def by(task: str, lora: str, touch: str) -> str:
@@ -98,6 +99,7 @@ def marked(scores: pd.DataFrame) -> pd.DataFrame:
         lacks=[*map(lacks, *(scores[axis] for axis in FULL))],
         whole=scores["measure"].isin({CHOICE, COMBINED, *(task.measure for task in TASKS.values())}),
         trained=~scores["task"].isin(untrained),
+        rated=scores["encoder"].str.extract(rf"{ADAPTED}(\d+)$", expand=False).astype(float),
     )
 
 
@@ -120,6 +122,7 @@ def ordered(frame: pd.DataFrame) -> pd.DataFrame:
     rank = pd.DataFrame({"task": frame["task"].map(lambda task: tasks.get(task, len(tasks)))}, index=frame.index)
     rank["measure"] = frame["measure"] != COMBINED
     rank["named"] = pd.factorize(frame["measure"])[0]
+    rank["rated"] = frame["rated"].fillna(-1) if "rated" in frame else -1
     for axis in FULL:
         rank[axis] = frame[axis] != FULL[axis] if axis in frame else False
     return frame.loc[rank.sort_values(list(rank.columns), kind="stable").index]
@@ -205,6 +208,8 @@ def system(row: dict[str, Any]) -> str:
         Shown.STANDARDISED: f"{encoder}, embeddings standardised by these videos",
         **{shown: f"{encoder}, {words}" for shown, words in WORDS["shown"].items()},
     }
+    if ADAPTED in encoder:
+        others |= {Shown.TOUCH: encoder.partition(ADAPTED)[0]}
     if touch in others:
         return others[touch]
     if task in (HEADS, VALIDATION_HEADS, RECALL):
@@ -219,6 +224,7 @@ COLUMNS: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
     "task": ("Task", lambda row: task_title(row["task"])),
     "measure": ("Measure", lambda row: "all properties right" if row["measure"] == COMBINED else row["measure"]),
     "system": ("System", system),
+    "rated": ("Rated objects", lambda row: number(row["rated"], 0)),
     "encoder": ("Encoder", lambda row: str(WORDS["encoders"].get(row["encoder"], row["encoder"]))),
     "lora": ("LoRA", itemgetter("lora")),
     "opd": ("OPD", itemgetter("opd")),

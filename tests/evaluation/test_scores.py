@@ -13,9 +13,11 @@ from pipeline.core.records import Part
 from pipeline.encoder.records import Classification
 from pipeline.evaluation.intervals import accuracy_interval
 from pipeline.evaluation.paired import paired
+from pipeline.evaluation.records import GradedVision, Shown
 from pipeline.evaluation.rows import EffectRow, ScoreRow
 from pipeline.evaluation.scores import effect_rows, score_rows, with_holm
 from pipeline.tasks import TASKS
+from pipeline.tasks.records import Score
 from tests.conftest import classified
 from tests.evaluation.conftest import CATALOGUE, PAIRS, graded
 
@@ -118,6 +120,21 @@ def test_effects_are_the_full_system_less_one_part() -> None:
     least = min(r.p for r in rows if r.p is not None)
     assert min(r.p_holm for r in rows if r.p_holm is not None) == pytest.approx(min(1, 6 * least), abs=1e-5)
     assert effect_rows(graded("PC", full[0]), CATALOGUE) == [], "nothing to compare with"
+
+
+def test_training_is_compared_with_the_most_ratings() -> None:
+    """On the same questions; with the language model that was adapted, not with its heads and rules."""
+    full, few, most, rules = drawn(), drawn(), drawn(), drawn()
+    own = set(Score.model_fields)
+    ways = ((few, 3, Shown.TOUCH), (most, 20, Shown.TOUCH), (rules, 20, Shown.CLASSES))
+    others = [
+        GradedVision(model=f"m, adapted by {count}", shown=shown, seed=0, **Score.model_dump(g, include=own))
+        for right, count, shown in ways
+        for g in graded("PC", right)
+    ]
+    (row,) = effect_rows(graded("PC", full), CATALOGUE, vision=others)
+    assert (row.part, row.change, row.n) == ("training", "full system - m, adapted by 20 rated objects", 15)
+    assert row.difference == pytest.approx(np.mean(full) - np.mean(most), abs=1e-6)
 
 
 Classes = tuple[int, int, int]

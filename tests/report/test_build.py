@@ -225,6 +225,29 @@ def test_the_shipped_models_answers_come_first_and_the_plumbing_is_folded(tmp_pa
     assert "75.0 [" in page[order[0] : order[1]]
 
 
+def test_the_learning_curve_is_a_table_and_a_figure(tmp_path: Path) -> None:
+    """Numbers of objects in their order, each system a row; adapted models are no models as they came."""
+    params = write_run(tmp_path, fake_params(*ONE, "ablation.train=false", "questions.evaluation={pc:4}"))
+    for model, right in (("m", 10), ("m, adapted by 20", 30), ("m, adapted by 3", 20)):
+        evaluated(tmp_path, model, right)
+        rows = read_table(tmp_path / "data" / "evaluated.parquet", GradedVision)
+        write_table(tmp_path / f"{model}.parquet", GradedVision, rows)
+    rows = [r for file in tmp_path.glob("m*.parquet") for r in read_table(file, GradedVision)]
+    rows += [r.model_copy(update={"shown": Shown.CLASSES}) for r in rows]
+    write_table(tmp_path / "data" / "evaluated.parquet", GradedVision, rows)
+    write_report(params, tmp_path)
+    folder = tmp_path / "reports" / params.report_name
+    text = (folder / "README.md").read_text()
+    assert re.findall(r"\(PC\) \| (\d+) \| (m|its heads[^|]*) \| (\S+) ", text) == [
+        ("3", "m", "50.0"),
+        ("3", "its heads and rules alone", "50.0"),
+        ("20", "m", "75.0"),
+        ("20", "its heads and rules alone", "75.0"),
+    ]
+    assert text.count("| m, as it is | 25.0") == 1
+    assert "ratings.png" in [f.name for f in (folder / "figures").iterdir()]
+
+
 def test_a_run_that_trains_nothing_reports_models_that_were_trained_before(tmp_path: Path) -> None:
     """With sets of different questions, whose accuracies stand beside the interval over all of them."""
     only = ("ablation.train=false", "questions.evaluation={opd:0,pc:4,pss:0,pom:0,psr:0}")

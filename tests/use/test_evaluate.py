@@ -26,13 +26,15 @@ from pipeline.evaluation.rows import ALL_SEEDS
 from pipeline.language.base import ADAPTER_CONFIG, ADAPTER_WEIGHTS
 from pipeline.report.load import load_report, published
 from pipeline.report.tables import measured
+from pipeline.running.errors import UserError
 from pipeline.scales import compose, write_params
 from pipeline.tasks.base import find_level
 from pipeline.use import folder
-from pipeline.use.evaluate import answers_about
+from pipeline.use.adapt import adapt
+from pipeline.use.evaluate import answers_about, answers_after_ratings
 from pipeline.use.folder import Base, find_base, read_folder
 from pipeline.use.model import Octopi
-from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.records import Assignment, Video
 from tests.closure import ROOT
 from tests.conftest import fake_videos
@@ -182,6 +184,40 @@ def test_a_runs_videos_are_asked_about_as_they_are_and_standardised(
             assert f" {row.predicted} " in said[row.objects[0]].sentence
     with pytest.raises(SystemExit, match=r"evaluate.models: octopi-small was trained on object_\S+, which"):
         run({next(iter(octopi.catalogue.objects)): "soft"})
+
+
+@pytest.mark.slow
+def test_after_ratings_it_answers_as_the_copy_that_adapt_makes(
+    octopi: Octopi, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """About test objects alone, whose ratings it never had; without ratings by the training videos alone."""
+    monkeypatch.setattr("pipeline.core.runtime.limit_threads", lambda _: None)
+    changed = [f"data.dir={EXAMPLES}", f"data.catalogue={ROOT}/pipeline/physiclear", "data.source=videos"]
+    few = ["kernels=machine", "questions.evaluation={opd:9,pc:0,pss:0,pom:0,psr:0}"]
+    params = compose("smoke", [*changed, *few], ROOT / "conf")
+    files = {"rug": "soft", "pillow": "soft", "baseball": "hard", "steel_wool": "rough"}
+    videos = [v.model_copy(update={"path": f"{files[v.object_id]}.mp4"}) for v in fake_videos([*files], per_object=1)]
+    parts = {"rug": Part.TRAIN, "baseball": Part.TRAIN}
+    split = [
+        Assignment(video_id=v.video_id, object_id=v.object_id, part=parts.get(v.object_id, Part.TEST)) for v in videos
+    ]
+    catalogue = load_catalogue(ROOT / "pipeline" / "physiclear")
+    own = [EXAMPLES / f"{files[name]}.mp4" for name in parts]
+    for count, ratings in ((0, None), (2, catalogue)):
+        graded = answers_after_ratings(octopi, params, videos, split, 0, count)
+        assert {r.model for r in graded} == {f"octopi-small, adapted by {count}"}
+        assert {r.objects for r in graded} == {("pillow",), ("steel_wool",)}
+        to = tmp_path / str(count)
+        adapt(octopi, own, to, catalogue=ratings, objects=[*parts])
+        copy = Octopi.from_pretrained(to, dtype="float32")
+        for row in graded:
+            said = copy.describe(EXAMPLES / f"{files[row.objects[0]]}.mp4")
+            if row.measure == "hardness" and row.shown is Shown.CLASSES:
+                assert row.predicted == said.levels["hardness"]
+            elif row.measure == "hardness":
+                assert f" {row.predicted} " in said.sentence
+    with pytest.raises(UserError, match=r"evaluate.rated: 3 objects, but seed 0 trains on 2"):
+        answers_after_ratings(octopi, params, videos, split, 0, 3)
 
 
 @pytest.mark.parametrize("update", [{"name": "warmth"}, {"levels": ("yielding", "springy", "rigid")}])
