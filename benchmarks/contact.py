@@ -17,7 +17,7 @@ from pipeline.config.params import load_params
 from pipeline.core.runtime import derive_seed
 from pipeline.running.parallel import run_parallel
 from pipeline.scenes.light import Image, make_sensor
-from pipeline.scenes.recipe import Recipe, load_recipes
+from pipeline.scenes.recipe import SceneRecipe, load_recipes
 from pipeline.scenes.render import make_scene, render
 from pipeline.videos.catalogue import load_catalogue
 
@@ -62,7 +62,7 @@ def measure(root: Path, objects: int | None = None, videos: int = 3) -> list[Row
     )
 
 
-def _look(job: tuple[str, int, Recipe]) -> list[tuple[float, float]]:
+def _look(job: tuple[str, int, SceneRecipe]) -> list[tuple[float, float]]:
     """One scene by every model: milliseconds a frame, contact included, and in the frame of most force the distance to
     the finest model, in 8-bit steps.
     """

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from pipeline.core.io import read_jsonl, write_jsonl
 from pipeline.core.layout import answers_dir, embeddings_dir, questions_file, trained_dir
-from pipeline.core.records import Encoder, Lora, Opd, Question, Touch, Variant
+from pipeline.core.records import Encoder, Lora, Opd, Question, TouchInput, Variant
 from pipeline.core.runtime import name_dtype
 from pipeline.running.parallel import device_here
 from pipeline.running.stage import matrix_key, stage
@@ -32,7 +32,7 @@ if __name__ == "__main__":
             run.metrics[f"{touch}.answers"] = len(predictions)
             run.metrics[f"{touch}.tokens"] = sum(p.tokens for p in predictions)
             run.metrics[f"{touch}.truncated"] = sum(p.truncated for p in predictions)
-            if variant.full and touch is Touch.REAL:
+            if variant.full and touch is TouchInput.REAL:
                 examples = read_jsonl(questions_file(variant.seed, "examples"), Question)
                 told = answer(model, store, examples, variant.opd, language, per_video, source)
                 write_jsonl(answers_dir(variant) / "examples.jsonl", told)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from safetensors.torch import load_file, save_file
 
-from pipeline.config import EncoderConfig, Recipe, RuntimeConfig
+from pipeline.config import EncoderConfig, RecipeName, RuntimeConfig
 from pipeline.core.io import write_table
 from pipeline.core.layout import PRETRAINED
 from pipeline.core.records import Part
@@ -65,7 +65,7 @@ def encoder_data(folder: Path, catalogue: Catalogue, parts: Mapping[str, Part], 
     return EncoderData(FrameStore(folder), catalogue, assignments, per_video)
 
 
-def config(weights: Path, recipe: Recipe, **changes: object) -> EncoderConfig:
+def config(weights: Path, recipe: RecipeName, **changes: object) -> EncoderConfig:
     tuned = {"backbone": ("scenes",), "reference": "subtract"} if recipe == "tuned" else {}
     own = {"recipe": recipe, "weights": str(weights), "prompts": 3}
     return EncoderConfig.model_validate({**own, **tuned, **changes})

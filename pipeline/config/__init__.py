@@ -13,7 +13,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, Strict, field_validator, model_validator
 
 from pipeline.core.layout import PRETRAINED, SCENES_DIR
-from pipeline.core.records import Encoder, Lora, Opd, Touch, Variant
+from pipeline.core.records import Encoder, Lora, Opd, TouchInput, Variant
 from pipeline.core.runtime import DeviceName, DtypeName, Kernels, Quantization
 from pipeline.running.errors import without_secrets
 
@@ -28,7 +28,7 @@ Seed = Annotated[Whole, Field(ge=0, lt=2**31)]
 QuestionCounts = dict[str, Annotated[Whole, Field(ge=0)]]
 """Questions of each task; `pipeline.tasks.questions.counts_by_task` knows which tasks there are."""
 
-Recipe = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]*$")]
+RecipeName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]*$")]
 """A name in `pipeline.encoder.recipes.RECIPES`; `octopi scale` checks that it is one."""
 Backend = Literal["processes", "ray"]
 TrainedEmbeddings = Literal["all", "new"]
@@ -171,7 +171,7 @@ class QuestionsConfig(Section):
 class EncoderConfig(Section):
     """The tactile encoder and its training on property labels."""
 
-    recipe: Recipe = "paper"
+    recipe: RecipeName = "paper"
     """`paper`: CLIP with visual prompts, three heads. `release`: the same as the published code has it. `tuned`: a
     frame classifier is fitted to any backbones' features, then trained on with their last stage (CLIP: prompts)."""
     backbone: tuple[str, ...] = Field(default=("clip",), min_length=1)
@@ -359,7 +359,7 @@ class AblationConfig(Section):
     """False: no variant is trained, and the run only evaluates the models of `evaluate.models`."""
     seeds: tuple[Seed, ...] = Field(default=(0,), min_length=1)
     """With split.name=kfold seeds are folds: [0, 1, 2] of three folds tests each object once, [0, ..., 5] twice."""
-    touch: tuple[Literal[Touch.REMOVED, Touch.SWAPPED, Touch.NOISE], ...] = ()
+    touch: tuple[Literal[TouchInput.REMOVED, TouchInput.SWAPPED, TouchInput.NOISE], ...] = ()
     """Input ablations: what the full system is also given in place of its videos, to test whether it uses touch."""
 
     @model_validator(mode="after")
@@ -378,9 +378,9 @@ class AblationConfig(Section):
         chosen = product(self.seeds, self.encoders, self.lora, self.opd) if self.train else ()
         return [Variant(encoder, lora, opd, seed) for seed, encoder, lora, opd in chosen]
 
-    def touches(self, variant: Variant) -> tuple[Touch, ...]:
+    def touches(self, variant: Variant) -> tuple[TouchInput, ...]:
         """What a variant is asked with: the questions' videos, and the full system also with every input ablation."""
-        return (Touch.REAL, *(self.touch if variant.full else ()))
+        return (TouchInput.REAL, *(self.touch if variant.full else ()))
 
 
 class EvaluateConfig(Section):

@@ -49,7 +49,7 @@ class Lora(StrEnum):
     WITHOUT = "without"
 
 
-class Touch(StrEnum):
+class TouchInput(StrEnum):
     """What the language model is given: the question's videos, or an input ablation in their place."""
 
     REAL = "real"

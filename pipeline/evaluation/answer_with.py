@@ -43,7 +43,7 @@ KINDS = {
 }
 
 
-class Reply(Record):
+class EndpointReply(Record):
     """What came back for one request: a line of cache.jsonl."""
 
     request: str
@@ -80,7 +80,7 @@ def ask_all(params: Params, url: str, settings: Mapping[str, Any], shown: Shown,
         every = [(seed, question) for seed, own in asked(params).items() for question in own]
         training = {seed: read_jsonl(questions_file(seed, "train"), Question) for seed in params.ablation.seeds}
         show = (frames if shown is Shown.FRAMES else photos)(folder, [question for _, question in every], most)
-        endpoint, used = _Endpoint(url, settings, place / "cache.jsonl"), dict[str, Reply]()
+        endpoint, used = _Endpoint(url, settings, place / "cache.jsonl"), dict[str, EndpointReply]()
         answers: dict[int, list[Prediction]] = {seed: [] for seed in training}
         for seed, question in track(every, name, "question"):
             turns = turns_of(question)
@@ -150,11 +150,11 @@ class _Endpoint:
         if not content.endswith(b"\n"):
             # Half a line, of a run that was killed while it wrote, is asked for again.
             cache.write_bytes(content[: content.rfind(b"\n") + 1])
-        self.known = {reply.request: reply for reply in read_jsonl(cache, Reply)}
+        self.known = {reply.request: reply for reply in read_jsonl(cache, EndpointReply)}
 
-    def converse(self, turns: Sequence[str], videos: Sequence[str], show: Show) -> list[Reply]:
+    def converse(self, turns: Sequence[str], videos: Sequence[str], show: Show) -> list[EndpointReply]:
         """Ask turn after turn, with pictures where a text has `{tactile}`; nothing follows a reply without text."""
-        messages, replies, touched = list[dict[str, Any]](), list[Reply](), iter(videos)
+        messages, replies, touched = list[dict[str, Any]](), list[EndpointReply](), iter(videos)
         for turn in turns:
             content: list[dict[str, Any]] = []
             for place, text in enumerate(turn.split("{tactile}")):
@@ -175,7 +175,7 @@ class _Endpoint:
             messages.append({"role": "assistant", "content": replies[-1].text})
         return replies
 
-    def _ask(self, request: str, messages: Any) -> Reply:
+    def _ask(self, request: str, messages: Any) -> EndpointReply:
         """What the endpoint says; a refusal to answer this question is a reply, too."""
         import openai
 
@@ -188,10 +188,10 @@ class _Endpoint:
             tokens = completion.usage.completion_tokens if completion.usage else 0
         except (openai.OpenAIError, ValueError, TypeError, AttributeError, IndexError) as error:
             if getattr(error, "status_code", 0) == 400 and getattr(error, "code", "") in FILTERS:
-                return Reply(request=request, ended=FILTERS[0])
+                return EndpointReply(request=request, ended=FILTERS[0])
             failed = isinstance(error, openai.OpenAIError | ValueError)
             why = str(error.__cause__ or error) if failed else f"no chat completion ({completion}); is the URL right?"
             why = " ".join(why.split()).replace(self.client.api_key, "[key]")[:300]
             raise UserError(f"{self.url}: {why}; what it said before is kept, run it again to go on") from None
         ended = "nothing" if ended == "stop" and not text else ended
-        return Reply(request=request, ended=ended, text=text, tokens=tokens, model=completion.model or "")
+        return EndpointReply(request=request, ended=ended, text=text, tokens=tokens, model=completion.model or "")

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator
 
-from pipeline.core.records import Encoder, Lora, Opd, Record, Touch, Variant
+from pipeline.core.records import Encoder, Lora, Opd, Record, TouchInput, Variant
 from pipeline.tasks.records import Score
 
 Share = Annotated[float, AfterValidator(lambda value: round(value, 6))]
@@ -45,7 +45,7 @@ class Graded(Score):
     """The replicate: with folds, all their answers together count as those of one seed."""
     trained: int
     """The seed of `ablation.seeds` under which the model was trained; with folds it says the fold."""
-    touch: Touch
+    touch: TouchInput
 
     @property
     def variant(self) -> Variant:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from statsmodels.stats.multitest import multipletests
 
-from pipeline.core.records import Encoder, Lora, Opd, Part, Touch
+from pipeline.core.records import Encoder, Lora, Opd, Part, TouchInput
 from pipeline.encoder.records import Classification
 from pipeline.evaluation.intervals import Objects, accuracy_interval
 from pipeline.evaluation.paired import Difference, paired
@@ -33,7 +33,7 @@ class Setting(NamedTuple):
     """For a vision-only model, the model."""
     lora: str = ""
     opd: str = ""
-    touch: str = Touch.REAL
+    touch: str = TouchInput.REAL
     """For a vision-only model, what it was shown in place of touch."""
 
 
@@ -46,7 +46,7 @@ CHANGES: tuple[tuple[str, Setting, Setting], ...] = (
     ("lora", FULL, FULL._replace(lora=Lora.WITHOUT)),
     ("opd", FULL, FULL._replace(opd=Opd.NONE)),
     ("opd", FULL, FULL._replace(opd=Opd.NEEDED)),
-    *(("touch", FULL, FULL._replace(touch=touch)) for touch in Touch if touch is not Touch.REAL),
+    *(("touch", FULL, FULL._replace(touch=touch)) for touch in TouchInput if touch is not TouchInput.REAL),
 )
 """The part, the full system, and what it is compared with."""
 

@@ -8,7 +8,7 @@ from itertools import accumulate, chain, pairwise
 
 import torch
 
-from pipeline.core.records import Question, Touch
+from pipeline.core.records import Question, TouchInput
 from pipeline.core.runtime import derive_seed
 from pipeline.language.chat import TACT_END, TACT_START, TACTILE
 from pipeline.running.errors import UserError
@@ -16,7 +16,7 @@ from pipeline.training.embeddings import EmbeddingStore
 
 
 def ablate_input(
-    store: EmbeddingStore, touch: Touch, questions: Sequence[Question], seed: int
+    store: EmbeddingStore, touch: TouchInput, questions: Sequence[Question], seed: int
 ) -> tuple[EmbeddingStore, Sequence[Question]]:
     """The store that a variant reads the questions' videos from, and the questions.
 
@@ -28,9 +28,9 @@ def ablate_input(
     Raises:
         UserError: where touch is to be swapped, and the questions are about one object alone.
     """
-    if touch is Touch.REAL:
+    if touch is TouchInput.REAL:
         return store, questions
-    if touch is Touch.REMOVED:
+    if touch is TouchInput.REMOVED:
         return store, [without_videos(q) for q in questions]
     found: dict[str, set[str]] = {}
     for question in questions:
@@ -38,7 +38,7 @@ def ablate_input(
             found.setdefault(object_id, set()).add(video_id)
     # In alphabetical order, so that what is drawn follows from the seed.
     videos = {o: sorted(found[o]) for o in sorted(found)}
-    if touch is Touch.SWAPPED:
+    if touch is TouchInput.SWAPPED:
         ring = list(videos)
         if len(ring) == 1:
             raise UserError(

@@ -14,7 +14,7 @@ from pipeline.config import AblationConfig, Params
 from pipeline.config.params import PARAMS_FILE
 from pipeline.core import layout
 from pipeline.core.io import R, read_csv, read_jsonl, read_table, write_csv, write_json, write_text
-from pipeline.core.records import TENSOR_FILE, Lora, Measurement, Part, Prediction, Question, Touch, Variant
+from pipeline.core.records import TENSOR_FILE, Lora, Measurement, Part, Prediction, Question, TouchInput, Variant
 from pipeline.encoder.records import Classification
 from pipeline.evaluation.calibration import CalibrationRow, calibrated, calibration_rows
 from pipeline.evaluation.grading import conclude, vision_models
@@ -99,8 +99,8 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     full = [variant for variant in params.ablation.variants() if variant.full]
     examples = [pair for v in full for pair in _answered(root, v, "examples", "examples")]
     chosen = choose_samples(
-        [pair for v in full[:1] for pair in _answered(root, v, "evaluation", Touch.REAL)],
-        [g for g in graded if g.variant in full[:1] and g.touch is Touch.REAL],
+        [pair for v in full[:1] for pair in _answered(root, v, "evaluation", TouchInput.REAL)],
+        [g for g in graded if g.variant in full[:1] and g.touch is TouchInput.REAL],
     )
     write_json(folder / "samples.json", {**chosen, **choose_examples(examples, catalogue)})
     write_text(folder / "params.yaml", without_places((root / PARAMS_FILE).read_text(encoding="utf-8")))
@@ -215,7 +215,7 @@ def described_frame(
     levels = {p.name: p.levels for p in catalogue.properties}
     sentences: dict[tuple[int, str], str] = {}
     for variant in (v for v in params.ablation.variants() if v.full):
-        for asked, answer in _answered(root, variant, "evaluation", Touch.REAL):
+        for asked, answer in _answered(root, variant, "evaluation", TouchInput.REAL):
             if asked.task == "OPD":
                 sentences[variant.seed, asked.videos[0]] = " ".join(answer.outputs[-1].split())
     rows: dict[tuple[int, str], dict[str, object]] = {}

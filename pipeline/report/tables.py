@@ -14,7 +14,7 @@ from typing import Any
 import pandas as pd
 import yaml
 
-from pipeline.core.records import Touch
+from pipeline.core.records import TouchInput
 from pipeline.evaluation.records import ADAPTED, Shown
 from pipeline.evaluation.rows import ALL_SEEDS, HEADS, RECALL, VALIDATION_HEADS
 from pipeline.report.load import DATASET, DATASETS, KEYS, Report, published
@@ -85,7 +85,7 @@ def marked(scores: pd.DataFrame) -> pd.DataFrame:
     def by(task: str, lora: str, touch: str) -> str:
         if task in WORDS["tasks"]:
             return task
-        if touch == Touch.REAL:
+        if touch == TouchInput.REAL:
             return "model" if lora else "rules"
         return "vision" if touch in WORDS["shown"] else "shipped" if touch in {*Shown} else "other touch"
 
@@ -141,7 +141,7 @@ def side_by_side(reports: Mapping[str, Report], *, every: bool) -> pd.DataFrame:
         about |= {dataset: published(dataset) for dataset in DATASETS}
     place, blocks = [*KEYS, "touch"], []
     for dataset, printed in sorted(about.items(), key=lambda pair: pair[0] != DATASET):
-        rows = printed[printed["model"].isin(PUBLISHED_MODELS)].assign(touch=str(Touch.REAL))
+        rows = printed[printed["model"].isin(PUBLISHED_MODELS)].assign(touch=str(TouchInput.REAL))
         if not len(printed) and not every and any(map(len, about.values())):
             # Nothing is published about such data: below the paper's rows stand the reports' own.
             rows = pd.concat([headline(r.scores) for r in reports.values() if r.provenance["dataset"] == dataset])

@@ -14,7 +14,7 @@ from pipeline.config import Params
 from pipeline.config.params import PARAMS_FILE, compose, scale_names
 from pipeline.core.io import write_text
 from pipeline.core.layout import answers_dir, encoder_dir, trained_dir
-from pipeline.core.records import Lora, Part, Touch
+from pipeline.core.records import Lora, Part, TouchInput
 from pipeline.encoder.recipes import check_recipe
 from pipeline.language.start import objects_met
 from pipeline.running.errors import UserError
@@ -88,7 +88,7 @@ def check_objects(params: Params, catalogue: Catalogue) -> str:
                 f"{where}: {len(training)} training objects have videos, but questions about three objects need three; "
                 f"add objects, or {mend}"
             )
-        if len(tested) == 1 and Touch.SWAPPED in params.ablation.touch:
+        if len(tested) == 1 and TouchInput.SWAPPED in params.ablation.touch:
             raise UserError(
                 f"ablation.touch: swapped gives a test object the touch of another, but with {where} only {tested[0]} "
                 "has videos; leave swapped out, or add test objects"

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from pipeline.scenes.geometry import Bar, Body, Flat, Round, Wedge
-from pipeline.scenes.recipe import Recipe
+from pipeline.scenes.recipe import SceneRecipe
 from pipeline.scenes.relief import AnyLayer, Creases, Digits, Domes, Grains, Plates, Ridges, Rough, Strands, Weave
 
 MODULUS_MPA = (0.015, 100.0)
@@ -27,12 +27,12 @@ LAYERS = {
 """The chance that an object has a layer of this kind."""
 
 
-def invent(rng: np.random.Generator) -> Recipe:
+def invent(rng: np.random.Generator) -> SceneRecipe:
     """Draw a body, up to three layers of relief and a modulus."""
     kept = rng.random(len(LAYERS)) < np.array(list(LAYERS.values()))
     relief = [_layer(kind, rng) for kind in itertools.compress(LAYERS, kept)]
     rng.shuffle(relief)
-    return Recipe(modulus=_log(rng, *MODULUS_MPA), body=_body(rng), relief=tuple(relief[:3]))
+    return SceneRecipe(modulus=_log(rng, *MODULUS_MPA), body=_body(rng), relief=tuple(relief[:3]))
 
 
 def _body(rng: np.random.Generator) -> Body:

@@ -24,7 +24,7 @@ from pipeline.scenes.contact import Method, press_by
 from pipeline.scenes.geometry import IMAGE_MM, heights
 from pipeline.scenes.invent import invent
 from pipeline.scenes.measure import BIG_SHARE, ROUGH_MM, bump_share, texture
-from pipeline.scenes.recipe import MODULUS_MPA, SCENES, Range, Recipe
+from pipeline.scenes.recipe import MODULUS_MPA, SCENES, Range, SceneRecipe
 from pipeline.videos.catalogue import OBJECTS, PROPERTIES, Catalogue, Object, load_catalogue
 
 WORDS = Path(__file__).parents[1] / "physiclear"
@@ -107,7 +107,7 @@ def write_catalogue(config: InventConfig, folder: Path) -> None:
         write_text(new / SCENES, "".join(f"{o}: {file.read_text()}\n" for o, file in entries))
 
 
-def draw(classes: tuple[int, int, int], rng: np.random.Generator) -> Recipe:
+def draw(classes: tuple[int, int, int], rng: np.random.Generator) -> SceneRecipe:
     """An object that measures as these classes, off their borders, in two patches under different forces."""
     hardness, roughness, bumpiness = classes
     while True:
@@ -122,7 +122,7 @@ def draw(classes: tuple[int, int, int], rng: np.random.Generator) -> Recipe:
             return recipe
 
 
-def _measures(recipe: Recipe, roughness: int, bumpiness: int, force: float, rng: np.random.Generator) -> bool:
+def _measures(recipe: SceneRecipe, roughness: int, bumpiness: int, force: float, rng: np.random.Generator) -> bool:
     """Whether a fresh patch has the texture and, pressed, shows the bumps of these classes."""
     surface = heights(recipe.body, recipe.relief, SIDE, PITCH, rng)
     view = tuple(slice((SIDE - size) // 2, (SIDE - size) // 2 + size) for size in (HEIGHT, WIDTH))

@@ -47,7 +47,7 @@ HELD = ("handle", "barrel", "grip")
 """Parts that are thicker in no direction but one."""
 
 
-class Recipe(Record):
+class SceneRecipe(Record):
     """An object as physics sees it."""
 
     modulus: Annotated[float, Field(ge=0.001, le=1e6)]
@@ -58,7 +58,7 @@ class Recipe(Record):
     """Whether the hand turns it under pressure, as in the public videos, or only presses."""
 
 
-def load_recipes(folder: Path, catalogue: Catalogue, seed: int) -> dict[str, Recipe]:
+def load_recipes(folder: Path, catalogue: Catalogue, seed: int) -> dict[str, SceneRecipe]:
     """A recipe for every object of the catalogue: listed in the folder's `scenes.yaml`, else drawn by `recipe_of`.
 
     What is wrong with the file is a UserError that names it, the object and the key.
@@ -67,7 +67,7 @@ def load_recipes(folder: Path, catalogue: Catalogue, seed: int) -> dict[str, Rec
     return {o: listed[o] if o in listed else recipe_of(o, catalogue, seed) for o in catalogue.objects}
 
 
-def recipe_of(object_id: str, catalogue: Catalogue, seed: int) -> Recipe:
+def recipe_of(object_id: str, catalogue: Catalogue, seed: int) -> SceneRecipe:
     """A recipe drawn from the labels of an object of the catalogue, whether or not it is listed in `scenes.yaml`.
 
     Raises:
@@ -95,14 +95,14 @@ def recipe_of(object_id: str, catalogue: Catalogue, seed: int) -> Recipe:
     bumps: AnyLayer = shaped(height=height, width=width, spacing=spacing)
     rms = _log_uniform(rng, ROUGH_RMS_MM[levels["roughness"]])
     rough = Rough(rms=rms, longest=rng.uniform(*ROUGH_LONGEST_MM))
-    return Recipe(
+    return SceneRecipe(
         modulus=_log_uniform(rng, MODULUS_MPA[levels["hardness"]]),
         body=Round(radii=(_log_uniform(rng, across), _log_uniform(rng, along))),
         relief=(bumps, rough) if levels["bumpiness"] > 0 else (rough,),
     )
 
 
-def _read(file: Path, catalogue: Catalogue) -> dict[str, Recipe]:
+def _read(file: Path, catalogue: Catalogue) -> dict[str, SceneRecipe]:
     try:
         entries = yaml.load(file.read_text(encoding="utf-8"), Loader=OneKeyLoader) or {}
     except (UnicodeDecodeError, yaml.YAMLError) as error:
@@ -114,7 +114,7 @@ def _read(file: Path, catalogue: Catalogue) -> dict[str, Recipe]:
         if object_id not in catalogue.objects:
             raise UserError(f"{file}: {object_id} is not in objects.csv; correct or remove the entry")
         try:
-            recipes[object_id] = Recipe.model_validate(entry)
+            recipes[object_id] = SceneRecipe.model_validate(entry)
         except ValidationError as error:
             what = first_problem(error)
             raise UserError(f"{file}: {object_id}: {what}; docs/scenes.md says which keys a recipe has") from None

@@ -19,7 +19,7 @@ from pipeline.scenes.grid import Heights
 from pipeline.scenes.light import Image, Sensor, shade
 from pipeline.scenes.measure import Measured, bump_share, texture
 from pipeline.scenes.motion import REACH_MM, Motion, make_motion
-from pipeline.scenes.recipe import Recipe
+from pipeline.scenes.recipe import SceneRecipe
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Scene:
     """In mm a pixel."""
 
 
-def make_scene(recipe: Recipe, config: ScenesConfig, frames: int, seed: int) -> Scene:
+def make_scene(recipe: SceneRecipe, config: ScenesConfig, frames: int, seed: int) -> Scene:
     """Draw a patch and a motion, and press; everything random follows from `seed`."""
     rng = np.random.default_rng(seed)
     pitch = IMAGE_MM[0] / config.width
@@ -56,7 +56,7 @@ def make_scene(recipe: Recipe, config: ScenesConfig, frames: int, seed: int) -> 
     return Scene(patch, imprint, motion, pitch)
 
 
-def measure_scene(scene: Scene, recipe: Recipe, config: ScenesConfig) -> Measured:
+def measure_scene(scene: Scene, recipe: SceneRecipe, config: ScenesConfig) -> Measured:
     """What the object's classes can be told from, in the middle of the patch under the largest force."""
     top, left = (scene.surface.shape[0] - config.height) // 2, (scene.surface.shape[1] - config.width) // 2
     view = (slice(top, top + config.height), slice(left, left + config.width))

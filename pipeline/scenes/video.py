@@ -17,7 +17,7 @@ from pipeline.core.runtime import derive_seed
 from pipeline.running.errors import UserError
 from pipeline.running.parallel import run_parallel
 from pipeline.scenes.light import make_sensor
-from pipeline.scenes.recipe import Recipe
+from pipeline.scenes.recipe import SceneRecipe
 from pipeline.scenes.render import make_scene, measure_scene, render
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.film import write_film
@@ -54,7 +54,7 @@ class SceneRow(Record):
     bumpiness: int
 
 
-def synthesize(recipes: Mapping[str, Recipe], config: ScenesConfig, folder: Path) -> list[SceneRow]:
+def synthesize(recipes: Mapping[str, SceneRecipe], config: ScenesConfig, folder: Path) -> list[SceneRow]:
     """Write `<object>_<number>.mp4` for every object asked for, several at a time; return how, sorted by name.
 
     Equal seeds give equal files on one machine.
@@ -91,7 +91,7 @@ def share_as_labelled(rows: Sequence[SceneRow], catalogue: Catalogue) -> float:
 class _Job(NamedTuple):
     object_id: str
     number: int
-    recipe: Recipe
+    recipe: SceneRecipe
 
     def __str__(self) -> str:
         return f"{self.object_id}_{self.number}.mp4"

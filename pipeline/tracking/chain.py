@@ -16,7 +16,7 @@ from pipeline.config import Params
 from pipeline.config.params import CHAIN, PARAMS_FILE
 from pipeline.core.io import check_made, read_json, read_table
 from pipeline.core.layout import GRADED, REPORTS, RUNS
-from pipeline.core.records import Touch, Variant
+from pipeline.core.records import TouchInput, Variant
 from pipeline.evaluation.records import Graded
 from pipeline.running.errors import UserError
 from pipeline.tasks import TASKS
@@ -103,7 +103,7 @@ def accuracies(params: Params) -> dict[str, dict[str, float]]:
             whole = TASKS[row["task"]].measure if row["task"] in TASKS else "choice"
             task = row["task"] if row["measure"] == whole else f"{row['task']}.{row['measure']}"
             cells = {task: row["accuracy"], f"low/{task}": row["low"], f"high/{task}": row["high"]}
-            if row["touch"] != Touch.REAL:
+            if row["touch"] != TouchInput.REAL:
                 cells = {f"{row['touch']}/{task}": row["accuracy"]}
             metrics = found.setdefault("-".join(row[axis] for axis in Variant._fields), {})
             metrics |= {name: round(float(cell), 4) for name, cell in cells.items() if cell not in ("", None)}

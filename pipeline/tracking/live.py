@@ -32,14 +32,14 @@ def live(run: Stage) -> Iterator[list[Any]]:
     try:
         from transformers import TrainerCallback
 
-        from pipeline.training.trainer import measured
+        from pipeline.training.trainer import logged_figures
 
         class Curves(TrainerCallback):
             """Logs what history.parquet is to hold, under the same names."""
 
             def on_log(self, args: Any, state: Any, control: Any, logs: Any = None, **more: Any) -> None:
                 now = int(time.time() * 1000)
-                points = [(name, value, now, state.global_step) for name, value in measured(logs or {}).items()]
+                points = [(name, value, now, state.global_step) for name, value in logged_figures(logs or {}).items()]
                 attempt(tracking, store.log, child, points)
 
         yield [Curves()]

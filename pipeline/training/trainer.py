@@ -150,7 +150,7 @@ class TrainingMonitor(TrainerCallback):
 
     def on_log(self, args: TrainingArguments, state: TrainerState, control: TrainerControl, **handled: Any) -> None:
         """Called by the Trainer after each logging step; UserError where loss or the gradient's norm is not finite."""
-        values = measured(handled["logs"])
+        values = logged_figures(handled["logs"])
         losses = {n: torch.tensor(v) for n, v in values.items() if n in ("loss", "grad_norm", "validation_loss")}
         check_finite(losses, state.global_step)
         # At a terminal the Trainer has a bar of its own.
@@ -259,7 +259,7 @@ def train(trainer: Trainer) -> Trained:
         Measurement(step=entry["step"], name=name, value=value)
         for entry in trainer.state.log_history
         # Sorted: a resumed state has its names in alphabetical order, a fresh one in the order of logging.
-        for name, value in sorted(measured(entry).items())
+        for name, value in sorted(logged_figures(entry).items())
     ]
     return Trained(history, state)
 
@@ -291,7 +291,7 @@ def _is_whole(file: Path) -> bool:
     return True
 
 
-def measured(entry: Mapping[str, object]) -> dict[str, float]:
+def logged_figures(entry: Mapping[str, object]) -> dict[str, float]:
     """What of a log entry is a figure of the training: not its bookkeeping, nor wall-clock times."""
     bookkeeping = ("step", "epoch", "total_flos", "train_loss")
     return {

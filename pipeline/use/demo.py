@@ -27,7 +27,7 @@ from pipeline.config import ScenesConfig
 from pipeline.core.records import GAIN, MIDDLE
 from pipeline.running.errors import UserError
 from pipeline.scenes.light import make_sensor
-from pipeline.scenes.recipe import Recipe, load_recipes
+from pipeline.scenes.recipe import SceneRecipe, load_recipes
 from pipeline.scenes.render import make_scene, render
 from pipeline.tasks.opd import TEMPLATES
 from pipeline.use.results import Exchange, Pictures, Touch
@@ -67,7 +67,7 @@ class Asked(BaseModel):
 class Session:
     """The model, the touches that were shown to it, and one thread that all its work is done in."""
 
-    def __init__(self, model: Octopi, catalogue: Catalogue, recipes: Mapping[str, Recipe]) -> None:
+    def __init__(self, model: Octopi, catalogue: Catalogue, recipes: Mapping[str, SceneRecipe]) -> None:
         self.model, self.scenes = model, recipes
         self.names = {object_id: catalogue.objects[object_id].name for object_id in recipes}
         self.folder = Path(tempfile.mkdtemp(prefix="octopi-demo-"))

@@ -15,7 +15,7 @@ from huggingface_hub import EvalResult
 from pipeline.config import LANGUAGE_DIR, Params
 from pipeline.core import layout
 from pipeline.core.io import atomic_folder, read_json, read_jsonl, read_table, save_tensors, sha256, write_json
-from pipeline.core.records import Encoder, Lora, Part, Question, Touch, Variant
+from pipeline.core.records import Encoder, Lora, Part, Question, TouchInput, Variant
 from pipeline.encoder.records import Classification
 from pipeline.evaluation.calibration import calibration_rows, fit_temperature
 from pipeline.evaluation.grading import conclude
@@ -142,7 +142,7 @@ def export(folder: Path, to: Path, *, with_base: bool = False, base: Path | None
             shutil.copytree(found, made / BASE_DIR)
 
 
-class Score(NamedTuple):
+class TaskScore(NamedTuple):
     """Accuracy on one task."""
 
     n: int
@@ -159,7 +159,7 @@ class Score(NamedTuple):
 
 def _scores(
     params: Params, variant: Variant, catalogue: Catalogue, classified: Sequence[Classification]
-) -> tuple[dict[str, Score], dict[str, Score]]:
+) -> tuple[dict[str, TaskScore], dict[str, TaskScore]]:
     """By task, the accuracy of one model and of its encoder's heads with rules, where it has an interval.
 
     With folds this is its own fold, about objects that it was not trained on; the report pools the models of all folds.
@@ -167,16 +167,16 @@ def _scores(
     graded = [
         g.model_copy(update={"seed": g.trained})
         for g in read_table(layout.GRADED, Graded)
-        if g.variant == variant and g.touch is Touch.REAL
+        if g.variant == variant and g.touch is TouchInput.REAL
     ]
     asked = read_jsonl(layout.questions_file(variant.seed), Question)
     taken = catalogue.asking(params.questions.scenarios).called(params.questions.names)
     heads = {variant.seed: conclude(asked, classified, taken)} if variant.encoder is Encoder.FINETUNED else {}
-    found: dict[bool, dict[str, Score]] = {True: {}, False: {}}
+    found: dict[bool, dict[str, TaskScore]] = {True: {}, False: {}}
     for row in score_rows(graded, catalogue, concluded=heads):
         whole = row.task in TASKS and row.measure == TASKS[row.task].measure and row.seed == str(variant.seed)
         if whole and row.low is not None and row.high is not None and row.chance is not None:
-            found[bool(row.lora)][row.task] = Score(row.n, row.accuracy, row.low, row.high, row.chance)
+            found[bool(row.lora)][row.task] = TaskScore(row.n, row.accuracy, row.low, row.high, row.chance)
     return found[True], found[False]
 
 
@@ -204,8 +204,8 @@ def _write_card(
     folder: Path,
     config: ModelConfig,
     classified: Sequence[Classification],
-    scores: Mapping[str, Score],
-    ruled: Mapping[str, Score],
+    scores: Mapping[str, TaskScore],
+    ruled: Mapping[str, TaskScore],
     params: Params,
     known: str,
 ) -> None:

@@ -59,7 +59,7 @@ def write_smollm2(folder: Path, source: Path, seed: int) -> None:
     AutoTokenizer.from_pretrained(where, gguf_file=file, **safely).save_pretrained(folder)
 
 
-class Recipe(NamedTuple):
+class PackagedWeights(NamedTuple):
     """How a base model is made."""
 
     write: Callable[[Path, Path, int], None]
@@ -72,7 +72,7 @@ class Recipe(NamedTuple):
 
 
 RECIPES = {
-    "efficientnet-lite0": Recipe(
+    "efficientnet-lite0": PackagedWeights(
         write_efficientnet,
         {
             "license": "apache-2.0",
@@ -83,7 +83,7 @@ RECIPES = {
         "EfficientNet-Lite0, trained on ImageNet-1k and published by Google for TensorFlow, converted to PyTorch by\n"
         "ML Illustrated and renamed here to timm's `tf_efficientnet_lite0`. It wants RGB as (value - 127) / 128.",
     ),
-    "smollm2": Recipe(
+    "smollm2": PackagedWeights(
         write_smollm2,
         {
             "license": "apache-2.0",
@@ -97,7 +97,7 @@ RECIPES = {
         "are widened and\nstay rounded.",
     ),
     **{
-        name: Recipe(
+        name: PackagedWeights(
             partial(write, name=name, **how),
             {"license": "mit", "library_name": library, "taught": "drawn at random and taught nothing"},
             "A model with random weights. It knows nothing: figures that it makes are chance.",

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 
-from pipeline.config import EncoderConfig, Recipe
+from pipeline.config import EncoderConfig, RecipeName
 from pipeline.encoder import frame_classifier
 from pipeline.encoder.data import EncoderData
 from pipeline.videos.catalogue import Catalogue
@@ -38,7 +38,7 @@ def gradient(optimizer: torch.optim.Optimizer) -> torch.Tensor:
     return torch.cat([p.grad.flatten() for group in optimizer.param_groups for p in group["params"]])
 
 
-def setting_of(recipe: Recipe, weights: Path, **changes: object) -> EncoderConfig:
+def setting_of(recipe: RecipeName, weights: Path, **changes: object) -> EncoderConfig:
     """Of a recipe; `tuned` stands on a tiny network of timm's."""
     if recipe != "tuned":
         return config(weights, recipe, **changes)

@@ -13,7 +13,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from pipeline.config import FramesConfig, PretrainConfig, Recipe, RuntimeConfig
+from pipeline.config import FramesConfig, PretrainConfig, RecipeName, RuntimeConfig
 from pipeline.core.records import Measurement, Part
 from pipeline.encoder import pretrain as pretraining
 from pipeline.encoder.data import EncoderData, classify
@@ -38,7 +38,7 @@ pytestmark = pytest.mark.usefixtures("elsewhere")
 
 
 def trained(
-    kind: Recipe, weights: Path, data: EncoderData, *, factor: float = 1.0, **changes: object
+    kind: RecipeName, weights: Path, data: EncoderData, *, factor: float = 1.0, **changes: object
 ) -> tuple[list[Measurement], State]:
     """The history and end state of a training, with the learning rate times `factor`."""
     setting = setting_of(kind, weights, **changes)
@@ -116,7 +116,7 @@ def in_order(history: list[Measurement]) -> list[tuple[int, str, float]]:
 @pytest.mark.usefixtures("few_fits")
 @pytest.mark.parametrize(("kind", "validated"), [("paper", False), ("release", True), ("tuned", True)])
 def test_a_killed_training_ends_as_if_it_had_not_been(
-    kind: Recipe, validated: bool, weights: Path, catalogue: Catalogue, tmp_path: Path, before_updates: Hook
+    kind: RecipeName, validated: bool, weights: Path, catalogue: Catalogue, tmp_path: Path, before_updates: Hook
 ) -> None:
     """Killed in the second epoch, and again in the third.
 

@@ -6,7 +6,7 @@ import itertools
 
 from hypothesis import strategies as st
 
-from pipeline.core.records import Encoder, Lora, Opd, Touch
+from pipeline.core.records import Encoder, Lora, Opd, TouchInput
 from pipeline.evaluation.intervals import Objects
 from pipeline.evaluation.records import Graded
 from pipeline.videos.catalogue import load_catalogue
@@ -46,7 +46,7 @@ def graded(
 ) -> list[Graded]:
     """One answer a question; the last `unread` could not be read."""
     about = objects or (PAIRS if measure == "choice" else [(o,) for o in OBJECTS] * 3)
-    whose = {"encoder": Encoder(encoder), "lora": Lora(lora), "opd": Opd(opd), "touch": Touch(touch)}
+    whose = {"encoder": Encoder(encoder), "lora": Lora(lora), "opd": Opd(opd), "touch": TouchInput(touch)}
     whose |= {"task": task, "measure": measure, "seed": seed, "trained": seed}
     whose |= {"truncated": False, "expected": "a", "predicted": ""}
     read = [i < len(right) - unread for i in range(len(right))]

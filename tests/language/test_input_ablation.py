@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from pipeline.core.records import Dialogue, Gold, Opd, Part, Question, Touch, Turn
+from pipeline.core.records import Dialogue, Gold, Opd, Part, Question, TouchInput, Turn
 from pipeline.language.conversations import evaluation_features
 from pipeline.language.input_ablation import ablate_input
 from pipeline.training.embeddings import EmbeddingStore
@@ -47,7 +47,7 @@ QUESTIONS = [question("ab"), question("cd"), question("ad", video=1)]
 def test_swapped_is_always_another_object_and_none_is_given_twice(store: EmbeddingStore) -> None:
     names = sorted({v for v, _ in store._rows})
     for seed in range(20):
-        ablated, given = ablate_input(store, Touch.SWAPPED, QUESTIONS, seed)[0], {}
+        ablated, given = ablate_input(store, TouchInput.SWAPPED, QUESTIONS, seed)[0], {}
         for asked in QUESTIONS:
             for video, own in zip(asked.videos, asked.objects, strict=True):
                 first = ablated.features(video, range(ablated.count(video)))
@@ -58,14 +58,14 @@ def test_swapped_is_always_another_object_and_none_is_given_twice(store: Embeddi
         assert sorted(given) == sorted(given.values()) == list("abcd")
         assert ablated.dim == DIM
     with refused("ablation.touch: swapped needs questions about two objects"):
-        ablate_input(store, Touch.SWAPPED, [question("a")], 0)
-    for touch in (Touch.SWAPPED, Touch.NOISE):
+        ablate_input(store, TouchInput.SWAPPED, [question("a")], 0)
+    for touch in (TouchInput.SWAPPED, TouchInput.NOISE):
         assert ablate_input(store, touch, [], 0)[0].dim == store.dim, "no test object has videos: nothing is asked"
 
 
 def test_noise_has_the_embeddings_moments_and_is_no_ones_touch(tmp_path: Path) -> None:
     store = store_of(tmp_path, {"a_0": 4000, "b_0": 4000})
-    ablated = ablate_input(store, Touch.NOISE, [question("ab")], 3)[0]
+    ablated = ablate_input(store, TouchInput.NOISE, [question("ab")], 3)[0]
     drawn = torch.cat([ablated.features(v, range(4000)) for v in ("a_0", "b_0")])
     mean, deviation = store.tensor.mean(0), store.tensor.std(0)
     # Five standard errors of a mean and of a deviation over 8000 draws.
@@ -75,7 +75,7 @@ def test_noise_has_the_embeddings_moments_and_is_no_ones_touch(tmp_path: Path) -
 
 
 def test_noise_is_the_same_at_each_call_and_differs_between_frames_videos_and_seeds(store: EmbeddingStore) -> None:
-    ablated, again, other = (ablate_input(store, Touch.NOISE, QUESTIONS, seed)[0] for seed in (3, 3, 4))
+    ablated, again, other = (ablate_input(store, TouchInput.NOISE, QUESTIONS, seed)[0] for seed in (3, 3, 4))
     first = ablated.features("a_1", [0, 1, 4])
     assert torch.equal(first[[2, 0]], again.features("a_1", [4, 0]))
     assert not torch.equal(first[0], first[1])
@@ -85,16 +85,16 @@ def test_noise_is_the_same_at_each_call_and_differs_between_frames_videos_and_se
 
 
 def test_real_touch_is_the_videos_own_and_removed_leaves_the_delimiters_alone(store: EmbeddingStore) -> None:
-    given, asked = ablate_input(store, Touch.REAL, QUESTIONS, 0)
+    given, asked = ablate_input(store, TouchInput.REAL, QUESTIONS, 0)
     assert (given, asked) == (store, QUESTIONS)
     real = evaluation_features(QUESTIONS[0], store, 3)
-    for touch in (Touch.SWAPPED, Touch.NOISE):
+    for touch in (TouchInput.SWAPPED, TouchInput.NOISE):
         given, asked = ablate_input(store, touch, QUESTIONS, 0)
         assert asked == QUESTIONS
         other = evaluation_features(QUESTIONS[0], given, 3)
         assert other.shape == real.shape
         assert not torch.equal(other, real)
-    given, asked = ablate_input(store, Touch.REMOVED, QUESTIONS, 0)
+    given, asked = ablate_input(store, TouchInput.REMOVED, QUESTIONS, 0)
     assert evaluation_features(asked[0], given, 3).shape == (0, DIM)
     assert [q.dialogues[0].turns[0].user for q in asked] == ["<tact_start><tact_end>" * 2] * 3
     assert [q.question_id for q in asked] == [q.question_id for q in QUESTIONS]

@@ -16,7 +16,7 @@ from pipeline.scenes import invented
 from pipeline.scenes.elastic import solver
 from pipeline.scenes.geometry import Flat
 from pipeline.scenes.invented import classes_of, draw, invented_catalogue, write_catalogue
-from pipeline.scenes.recipe import Recipe, load_recipes
+from pipeline.scenes.recipe import SceneRecipe, load_recipes
 from pipeline.scenes.render import make_scene, measure_scene
 from pipeline.videos.catalogue import load_catalogue
 from tests.closure import ROOT
@@ -49,8 +49,8 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def drawn(classes: tuple[int, int, int], rng: np.random.Generator) -> Recipe:
-    return Recipe(modulus=1 + classes[0] + rng.random(), body=Flat())
+def drawn(classes: tuple[int, int, int], rng: np.random.Generator) -> SceneRecipe:
+    return SceneRecipe(modulus=1 + classes[0] + rng.random(), body=Flat())
 
 
 def test_it_is_written_as_a_catalogue_of_seed_and_number(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -73,7 +73,7 @@ def test_it_is_written_as_a_catalogue_of_seed_and_number(here: Path, monkeypatch
 def test_a_killed_drawing_goes_on_from_what_is_finished(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[tuple[int, int, int]] = []
 
-    def dies(classes: tuple[int, int, int], rng: np.random.Generator) -> Recipe:
+    def dies(classes: tuple[int, int, int], rng: np.random.Generator) -> SceneRecipe:
         calls.append(classes)
         if len(calls) == 20:
             raise KeyboardInterrupt

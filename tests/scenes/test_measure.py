@@ -15,7 +15,7 @@ from pipeline.scenes.contact import Method, press_by
 from pipeline.scenes.geometry import IMAGE_MM, heights
 from pipeline.scenes.grid import Heights
 from pipeline.scenes.measure import BIG_SHARE, VISIBLE_MM, Measured, bump_share, texture
-from pipeline.scenes.recipe import Recipe, load_recipes, recipe_of
+from pipeline.scenes.recipe import SceneRecipe, load_recipes, recipe_of
 from pipeline.videos.catalogue import Catalogue
 from tests.conftest import ROOT
 
@@ -25,7 +25,7 @@ FORCE_N = 8.0
 """A firm press; a light one does not bring every bump out, which scenes.csv shows."""
 
 
-def look(recipe: Recipe, seed: int) -> Measured:
+def look(recipe: SceneRecipe, seed: int) -> Measured:
     """The measures of one press onto the middle of a patch."""
     patch = heights(recipe.body, recipe.relief, SIDE, PITCH, np.random.default_rng(seed))
     skin = press_by(Method("layer", 128), patch, np.array([FORCE_N]), recipe.modulus, PITCH).skins[0]
@@ -37,7 +37,7 @@ def look(recipe: Recipe, seed: int) -> Measured:
 X, Y = np.meshgrid(np.arange(WIDTH) * PITCH, np.arange(HEIGHT) * PITCH)
 
 
-def agreeing(recipes: Mapping[str, Recipe], catalogue: Catalogue) -> float:
+def agreeing(recipes: Mapping[str, SceneRecipe], catalogue: Catalogue) -> float:
     """The share of objects that measure as their labels say, by three seeds in turn; no measure sees a label."""
     found = {o: look(recipe, number % 3) for number, (o, recipe) in enumerate(recipes.items())}
     return fmean((m.hardness, m.roughness, m.bumpiness) == catalogue.labels(o) for o, m in found.items())
@@ -62,7 +62,7 @@ def test_texture_passes_short_waves_and_stops_long_ones() -> None:
 
 @given(st.floats(5, 1e3), st.floats(5, 1e3))
 def test_curvature_is_no_texture(across: float, along: float) -> None:
-    recipe = Recipe.model_validate({"modulus": 1, "body": {"kind": "round", "radii": [across, along]}})
+    recipe = SceneRecipe.model_validate({"modulus": 1, "body": {"kind": "round", "radii": [across, along]}})
     assert texture(heights(recipe.body, recipe.relief, WIDTH, PITCH, np.random.default_rng(0)), PITCH) < 2e-4
 
 

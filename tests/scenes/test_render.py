@@ -12,7 +12,7 @@ from pipeline.scenes import video
 from pipeline.scenes.contact import GEL
 from pipeline.scenes.geometry import IMAGE_MM, Round
 from pipeline.scenes.light import make_sensor
-from pipeline.scenes.recipe import Recipe, load_recipes
+from pipeline.scenes.recipe import SceneRecipe, load_recipes
 from pipeline.scenes.render import make_scene, render
 from pipeline.scenes.video import share_as_labelled, synthesize
 from pipeline.videos.catalogue import Catalogue
@@ -21,12 +21,12 @@ from tests.conftest import ROOT, refused
 from tests.frame_rules import decode, scanned
 
 SMALL = ScenesConfig(objects=("rug",), videos_per_object=2, frames=8, width=64, height=48)
-PLAIN = Recipe(modulus=100.0, body=Round(radii=(30.0, 30.0)))
+PLAIN = SceneRecipe(modulus=100.0, body=Round(radii=(30.0, 30.0)))
 PHYSICLEAR = ROOT / "pipeline" / "physiclear"
 
 
 @pytest.fixture(scope="module")
-def recipes(catalogue: Catalogue) -> dict[str, Recipe]:
+def recipes(catalogue: Catalogue) -> dict[str, SceneRecipe]:
     return load_recipes(PHYSICLEAR, catalogue, 0)
 
 
@@ -74,7 +74,7 @@ def in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("in_turn")
 def test_files_are_equal_for_equal_seeds_and_as_their_rows_say(
-    recipes: dict[str, Recipe], catalogue: Catalogue, tmp_path: Path
+    recipes: dict[str, SceneRecipe], catalogue: Catalogue, tmp_path: Path
 ) -> None:
     folders = [tmp_path / "a b", tmp_path / "c"]
     rows, again = (synthesize(recipes, SMALL.model_copy(update={"fps": 10.0}), folder) for folder in folders)
@@ -90,7 +90,7 @@ def test_files_are_equal_for_equal_seeds_and_as_their_rows_say(
 
 
 @pytest.mark.usefixtures("in_turn")
-def test_rows_say_what_scenes_measure_as(recipes: dict[str, Recipe], catalogue: Catalogue, tmp_path: Path) -> None:
+def test_rows_say_what_scenes_measure_as(recipes: dict[str, SceneRecipe], catalogue: Catalogue, tmp_path: Path) -> None:
     config = SMALL.model_copy(update={"objects": ("egg", "basket"), "videos_per_object": 1, "frames": 2})
     rows = synthesize(recipes, config, tmp_path)
     for row in rows:

@@ -22,7 +22,7 @@ from pipeline.core.records import (
     Part,
     Prediction,
     Question,
-    Touch,
+    TouchInput,
     Variant,
 )
 from pipeline.core.runtime import seed_everything
@@ -135,7 +135,7 @@ def make(where: Path, variant: Variant, *overrides: str) -> Made:
     write_jsonl(data / "answers" / variant.key / "real.jsonl", predictions)
     write_jsonl(data / "questions" / "0" / "evaluation.jsonl", questions)
     graded = [
-        Graded(**{**score.model_dump(), "correct": right}, **variant._asdict(), trained=fold, touch=Touch.REAL)
+        Graded(**{**score.model_dump(), "correct": right}, **variant._asdict(), trained=fold, touch=TouchInput.REAL)
         for score in grade(questions, predictions, catalogue)
         # Another fold's model, whose answers are all right, is pooled under the same seed, and is not packaged.
         for fold, right in ((0, score.correct), (1, True))
