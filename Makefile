@@ -21,7 +21,7 @@ export PYTHONUNBUFFERED := 1
 export PYTHONUTF8 := 1
 export HF_HUB_OFFLINE := 1
 
-.PHONY: help install repro test test-fast stability drill lint dashboard bench clean
+.PHONY: help install repro test test-fast stability drill lint dashboard bench docs clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 12
@@ -73,5 +73,8 @@ bench: install  ## speed against error of one SECTION=..., into reports/speed_er
 	python -m benchmarks $(SECTION)
 	octopi page
 
+docs: install  ## the documents as a site, in site/
+	NO_MKDOCS_2_WARNING=1 mkdocs build
+
 clean:  ## remove what runs have made; reports stay
-	rm -rf data runs checkpoints mlruns .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf data runs checkpoints mlruns site .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -46,7 +46,7 @@ def test_everything_that_was_promised_is_there_in_the_folder_that_dvc_knows(writ
     assert stage["outs"] == [{"reports/${scale}-${data.source}": {"cache": False}}]
     text = (written / "README.md").read_text()
     assert set(re.findall(r"\]\(([^)#]+)\)", text)) == {*FILES, "../index.html"} - {"README.md", "metrics.json"}
-    assert all(table.title in text for table in TABLES)
+    assert all(table.title in text for table in TABLES if table.key != "ratings"), "no model was adapted"
 
 
 @pytest.mark.parametrize("path", ["/home/me/my videos", "'/home/me/my videos'", "~/my videos", "/home/me/my videos/"])
