@@ -3,8 +3,8 @@
 from collections import Counter
 from itertools import product
 
-from pipeline.core.io import read_table, write_table
-from pipeline.core.layout import EVALUATED, SHIPPED, VIDEOS, split_file
+from pipeline.core.io import code_of, fingerprint, read_table, write_table
+from pipeline.core.layout import CHECKPOINTS, EVALUATED, SHIPPED, VIDEOS, split_file
 from pipeline.core.runtime import limit_threads
 from pipeline.evaluation.records import GradedVision, Shown
 from pipeline.running.errors import UserError
@@ -33,7 +33,13 @@ if __name__ == "__main__":
             octopi = Octopi.from_pretrained(place, device=params.runtime.device, dtype=params.language.dtype)
             graded += answers_about(octopi, params, videos, parts)
             for count, (seed, split) in product(params.evaluate.rated, splits.items()):
-                graded += answers_after_ratings(octopi, params, videos, split, seed, count)
+                # A killed stage goes on behind what is answered; the key is all that this depends on, code included.
+                told = (octopi.config.digest, params.questions, params.data, params.split, octopi.llm.dtype)
+                key = fingerprint(*map(str, (*told, count, seed)), VIDEOS, split_file(seed), *code_of("evaluate"))
+                if not (done := CHECKPOINTS / "evaluate" / key / EVALUATED.name).is_file():
+                    said = answers_after_ratings(octopi, params, videos, split, seed, count)
+                    write_table(done, GradedVision, said)
+                graded += read_table(done, GradedVision)
         run.metrics["answers"] = len(
             {(g.model, g.shown, g.question_id) for g in graded if g.shown is not Shown.CLASSES}
         )
