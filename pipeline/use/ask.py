@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import logging
+import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -148,7 +150,7 @@ def digest(file: Path) -> str:
 def named_objects(text: str) -> list[str] | dict[str, list[str]]:
     """What `--names` says: "NAME, NAME" of a catalogue, or names with classes, "NAME: CLASS, CLASS; NAME: ..."."""
     if ":" not in text:
-        return [name.strip() for name in text.split(",")]
+        return [name.strip() for name in re.split("[,;]", text) if name.strip()]
     told = [part.partition(":") for part in text.split(";") if part.strip()]
     return {name.strip(): [c.strip() for c in classes.split(",")] for name, _, classes in told}
 
@@ -205,6 +207,9 @@ def described(model: Octopi, paths: Sequence[Path]) -> tuple[Table, list[str]]:
         UserError: the first video's error, where none could be described.
     """
     files = videos_of(paths)
+    # The beginning of a path tells nobody which video it is; that of several of one name has to.
+    named = Counter(file.name for file, _ in files)
+    files = [(file, name if named[file.name] > 1 else readable(file.name)) for file, name in files]
     # Folded, since names that are cut may be those of several files.
     table = Table(*(Column(name, overflow="fold") for name in ("video", *model.properties, "in words")))
     notes, errors = [*model.doubts], list[str]()

@@ -21,8 +21,8 @@ from pipeline.config import EncoderConfig, FramesConfig, LanguageConfig
 from pipeline.core.io import fingerprint, read_json, sha256
 from pipeline.core.records import Encoder, Opd, Record, Turn
 from pipeline.language.chat import render
-from pipeline.running.errors import UserError, first_problem
-from pipeline.videos.catalogue import Catalogue
+from pipeline.running.errors import UserError, did_you_mean, first_problem
+from pipeline.videos.catalogue import Catalogue, Property
 from pipeline.weights.make import PACKAGED, make
 
 if TYPE_CHECKING:
@@ -198,6 +198,22 @@ def chat_sample(tokenizer: PreTrainedTokenizerBase, language: LanguageConfig) ->
     turns = [Turn(user="a {tactile}", assistant="b"), Turn(user="c", assistant="d")]
     system, chat = language.system_prompt, language.chat
     return render(turns, tokenizer, system_prompt=system, frames=1, complete=True, chat=chat).text
+
+
+def find_property(catalogue: Catalogue, word: str) -> tuple[Property, bool]:
+    """The property that a word names ("hardness", "softer", "hardest"), and whether its high classes are meant.
+
+    Raises:
+        UserError: for any other word.
+    """
+    known: dict[str, tuple[Property, bool]] = {}
+    for p in catalogue.properties:
+        high, low = (p.name, p.spoken, p.more, p.most), (p.less, p.least)
+        known |= dict.fromkeys(high, (p, True)) | dict.fromkeys(low, (p, False))
+    if found := known.get(word.lower()):
+        return found
+    words = ", ".join(f"{p.name} ({p.more}, {p.less})" for p in catalogue.properties)
+    raise UserError(f"{word}: no property of this model; {did_you_mean(word.lower(), known)}it knows {words}")
 
 
 def distance(standardised: npt.NDArray[np.float64]) -> float:

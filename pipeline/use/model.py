@@ -26,11 +26,11 @@ from pipeline.running.progress import quiet_libraries
 from pipeline.tasks import opd, pc, pom, psr, pss
 from pipeline.tasks.base import LETTERS
 from pipeline.use.encoding import Classified, EncodedVideo, VideoEncoder
-from pipeline.use.folder import ENCODER_DIR, ModelConfig, chat_sample, find_base, read_folder
+from pipeline.use.folder import ENCODER_DIR, ModelConfig, chat_sample, find_base, find_property, read_folder
 from pipeline.use.hub import HUB, download
 from pipeline.use.memory import Remembered, most_similar, recall, remember
 from pipeline.use.results import Choice, Comparison, Description, Exchange, Matching, Ranking, Recognition, Touch, Video
-from pipeline.videos.catalogue import Catalogue, Object, Property
+from pipeline.videos.catalogue import Catalogue, Object
 from pipeline.weights import is_random
 from pipeline.weights.backbones import reads_weights
 
@@ -240,21 +240,23 @@ class Octopi:
         return described
 
     def compare(self, a: Video, b: Video, property: str) -> Comparison:
-        """Whether the first video is more of a property than the second, in the wording of training."""
-        known = self._property(property)
-        question = pc.asked(pc.TEMPLATES[0], known.more, known.spoken)[self.config.opd]
+        """Whether the first video is more of a property ("hardness", "harder") than the second, or less ("softer")."""
+        known, rising = find_property(self.catalogue, property)
+        question = pc.asked(pc.TEMPLATES[0], known.more if rising else known.less, known.spoken)[self.config.opd]
         answer = self.ask(question, [a, b])
         return Comparison(question=question, answer=answer, choice=pc.read(answer), notes=self.notes([a, b]))
 
     def rank(self, videos: Sequence[Video], property: str) -> Ranking:
         """Videos by a property, least first: by the heads, and the model's own answer for two or three.
 
+        By "softer" or "softest" in place of "hardness", the hardest is first.
+
         Raises:
             UserError: for fewer than two videos, or one in which nothing is touched.
         """
         if len(videos) < 2:
             raise UserError(f"{counted(len(videos), 'video')}: two or more can be ranked")
-        known = self._property(property)
+        known, rising = find_property(self.catalogue, property)
         place = self.properties.index(known.name)
         expected: list[float] = []
         notes: list[str] = []
@@ -266,13 +268,14 @@ class Octopi:
         if not self.config.speaks:
             notes.append(MUTE)
         elif len(videos) == 3:
-            answer = self.ask(pss.asked(pss.TEMPLATES[0], known.most, known.spoken)[self.config.opd], videos)
+            superlative = known.most if rising else known.least
+            answer = self.ask(pss.asked(pss.TEMPLATES[0], superlative, known.spoken)[self.config.opd], videos)
             letter = pss.read(answer)
             most = None if letter is None else LETTERS.index(letter)
         elif len(videos) == 2:
             compared = self.compare(videos[0], videos[1], property)
             answer, most = compared.answer, {"yes": 0, "no": 1}.get(compared.choice or "")
-        order = sorted(range(len(videos)), key=expected.__getitem__)
+        order = sorted(range(len(videos)), key=lambda i: expected[i] if rising else -expected[i])
         if most is not None and most != order[-1]:
             notes.append(APART)
         return Ranking(
@@ -447,18 +450,12 @@ class Octopi:
                 return known[key]
         hint = did_you_mean(name.lower(), known)
         raise UserError(
-            f"{name}: the model's catalogue has no such object; {hint}tell what it is like ({self._example()})"
+            f"{name}: the model's catalogue has no such object; {hint}write what each is like, one class of every "
+            f"property ({self._example(name)}; ...)"
         )
 
-    def _example(self) -> str:
-        return "NAME: " + ", ".join("|".join(p.levels) for p in self.catalogue.properties)
-
-    def _property(self, name: str) -> Property:
-        for known in self.catalogue.properties:
-            if name.lower() in (known.name, known.spoken):
-                return known
-        hint = did_you_mean(name.lower(), self.properties)
-        raise UserError(f"{name}: no property of this model; {hint}it knows {', '.join(self.properties)}")
+    def _example(self, name: str = "NAME") -> str:
+        return f"{name}: " + ", ".join("|".join(p.levels) for p in self.catalogue.properties)
 
 
 def _listed(videos: Video | Sequence[Video]) -> tuple[Video, ...]:

@@ -15,7 +15,7 @@ from typer.testing import CliRunner, Result
 from pipeline.cli import app, main
 from pipeline.running import progress
 from pipeline.use import ask as asking
-from pipeline.use.ask import Chat, describe_folder
+from pipeline.use.ask import Chat, describe_folder, described
 from pipeline.use.model import Octopi
 from tests.conftest import not_utf8, refused
 from tests.report.shared import rows_of
@@ -158,6 +158,22 @@ def test_described_by_command(by_command: Command, folder: Path, files: list[Pat
     by_command("describe", broken, status=1)
 
 
+def test_a_row_of_the_table_has_its_files_name(octopi: Octopi, files: list[Path], tmp_path: Path) -> None:
+    """Those of two that are called alike have what tells them apart."""
+    table, _ = described(octopi, [*files[:2], twin := Path(shutil.copy(files[1], tmp_path))])
+    assert [*table.columns[0].cells] == [files[0].name, str(files[1]), str(twin)]
+
+
+def test_an_unknown_property_is_refused_before_a_model_is_loaded(
+    made: Made, files: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Octopi, "from_pretrained", lambda *_, **__: pytest.fail("loaded"))
+    for words in (("compare", *files[:2], "softness"), ("rank", "softness", *files[:2])):
+        found = CliRunner().invoke(app, [*map(str, words), "--model", str(made.folder)])
+        assert "softness: no property of this model; " in str(found.exception)
+        assert "hardness (harder, softer)" in str(found.exception)
+
+
 def test_described_compared_ranked_and_matched_by_command(
     by_command: Command, octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -181,7 +197,7 @@ def test_described_compared_ranked_and_matched_by_command(
     assert scale.endswith("0 smooth, 1 slightly rough, 2 rough")
     own = {"mug": ["hard", "smooth", "no bumps"], "rug": ["soft", "rough", "no bumps"]}
     typed = "mug: hard, smooth, no bumps; rug: soft, rough, no bumps"
-    for named, given in (("rug, millet", ["rug", "millet"]), (typed, own)):
+    for named, given in (("rug, millet", ["rug", "millet"]), ("rug; millet", ["rug", "millet"]), (typed, own)):
         matched = octopi.match([one, two], given)
         *lines, answer = said("match", one, two, "--names", named).rstrip("\n").split("\n")
         assert answer == matched.answer

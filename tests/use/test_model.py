@@ -150,6 +150,11 @@ def test_typed_tasks(octopi: Octopi, files: list[Path], monkeypatch: pytest.Monk
     assert sorted(ranked.order) == [0, 1, 2]
     assert [ranked.expected[i] for i in ranked.order] == sorted(ranked.expected)
     assert octopi.rank(files[:2], "hardness").most == 1
+    said["Is the object"] = "Conclusion: Yes, the first object is softer."
+    softer = octopi.compare(files[0], files[1], "softer")
+    assert (softer.choice, "softer than" in softer.question) == ("yes", True)
+    softest = octopi.rank(files[:2], "softest")
+    assert (softest.order, softest.most) == (octopi.rank(files[:2], "hardness").order[::-1], 0)
     assert octopi.rank([*files, files[0]], "hardness").answer == ""
     matched = octopi.match(files, names)
     assert matched.names == (names[0], names[2], names[1])
@@ -216,7 +221,7 @@ def test_videos_that_cannot_be_used_are_refused(octopi: Octopi, tmp_path: Path, 
 def test_unknown_words_are_refused(octopi: Octopi, files: list[Path]) -> None:
     with refused(r"hardnes: no property of this model; did you mean hardness\? it knows"):
         octopi.compare(files[0], files[1], "hardnes")
-    with refused("a unicorn: .*catalogue has no such object; .*NAME: soft"):
+    with refused("a unicorn: .*catalogue has no such object; .*a unicorn: soft"):
         octopi.match(files, ["rug", "millet", "a unicorn"])
     with refused(r"NAME: soft\|moderately hard\|hard, .*no bumps"):
         octopi.match(files[:2], {"a mug": ("hard", "smooth", "bumpy"), "a rug": ("soft", "rough", "no bumps")})
