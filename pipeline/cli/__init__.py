@@ -385,10 +385,13 @@ def ask(
     elif json:
         typer.echo(dumps(answer_once(asked, question, videos or ()), ensure_ascii=False))
     else:
+        said = ""
         for piece in asked.stream(question, videos or ()):
             typer.echo(piece, nl=False)
+            said += piece
         typer.echo()
-        _print_notes(asked.notes(videos or (), question))
+        heads = asked.verdict(question, videos or ())
+        _print_notes((*asked.apart(said, heads), *asked.notes(videos or (), question)), heads.shown if heads else "")
 
 
 @app.command()
@@ -415,6 +418,7 @@ def describe(
     rows, failed = describe_folder(asked, videos, csv)
     lacking = f", {failed} of them not described (column error; delete their rows to try them again)" if failed else ""
     typer.echo(f"{csv}: {counted(rows, 'video')}{lacking}")
+    _print_notes(asked.doubts)
     if failed == rows:
         raise typer.Exit(1)
 
@@ -426,7 +430,7 @@ def compare(
     """Say whether the first video has more of a property than the second."""
     found = _load(model, base, device, property).compare(a, b, property)
     typer.echo(found.answer)
-    _print_notes(found.notes)
+    _print_notes(found.notes, found.heads)
 
 
 @app.command()
@@ -608,8 +612,10 @@ def demo(
     serve_demo(lambda: _load(folder, base, device), catalogue, port)
 
 
-def _print_notes(notes: Sequence[str]) -> None:
-    """Print what speaks against an answer on the error stream, each note once."""
+def _print_notes(notes: Sequence[str], heads: str = "") -> None:
+    """Print on the error stream what the property heads say, and what speaks against an answer, each note once."""
+    if heads:
+        typer.echo(f"property heads: {heads}", err=True)
     for note in dict.fromkeys(notes):
         typer.echo(f"note: {note}", err=True)
 

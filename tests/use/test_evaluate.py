@@ -13,6 +13,7 @@ from typing import Any, cast
 
 import pytest
 import torch
+from huggingface_hub import metadata_load
 from safetensors.torch import load_file
 from typer.testing import CliRunner
 
@@ -31,7 +32,7 @@ from pipeline.tasks.base import find_level
 from pipeline.use import folder
 from pipeline.use.evaluate import answers_about
 from pipeline.use.folder import Base, find_base, read_folder
-from pipeline.use.model import Octopi
+from pipeline.use.model import REAL, Octopi, on_real_videos
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.records import Assignment, Video
 from tests.closure import ROOT
@@ -60,8 +61,22 @@ def test_its_figures_are_those_of_its_card() -> None:
     config, _ = read_folder(SHIPPED)
     assert set(config.scores) == {"OPD", "PC", "PSS", "POM", "PSR"}
     scores = {t: f"{100 * x:.1f} [{100 * low:.1f}, {100 * high:.1f}]" for t, (x, low, high) in config.scores.items()}
-    card = re.findall(r"\(([A-Z]+)\) \| \d+ \| (\S+ \[.*?\])", (SHIPPED / "README.md").read_text(encoding="utf-8"))
+    own, _, real = (SHIPPED / "README.md").read_text(encoding="utf-8").partition("## Scores on real videos")
+    card = re.findall(r"\(([A-Z]+)\) \| \d+ \| (\S+ \[.*?\])", own)
     assert dict(card) == scores
+    # Those on real videos are the report's, in the table, in its front matter, and in the note of every answer.
+    rows = load_report(ROOT / "reports" / "small-videos").scores.query(
+        f"encoder == 'octopi-small' and seed == {ALL_SEEDS!r} and measure in ['choice', 'combined']"
+    )
+    index = metadata_load(SHIPPED / "README.md")["model-index"][0]["results"]
+    front = {r["dataset"]["config"]: r["metrics"][0] for r in index if r["dataset"]["type"] == REAL}
+    for task in config.scores:
+        model, rules = (dict(rows[(rows.task == task) & (rows.touch == t)].iloc[0]) for t in ("touch", "classes"))
+        assert f"({task}) | {model['n']} | {measured(model)} | {measured(rules)} | {100 * model['chance']:.1f}" in real
+        assert front[task]["value"] == model["accuracy"]
+        assert front[task]["args"] == {key: model[key] for key in ("low", "high", "chance", "n")}
+        if task == "OPD":
+            assert f"{100 * model['accuracy']:.1f} % [{100 * model['low']:.1f}, " in on_real_videos(SHIPPED)
 
 
 def test_the_readmes_first_table_is_that_of_the_reports() -> None:
