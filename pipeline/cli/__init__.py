@@ -260,6 +260,8 @@ def _print_findings(findings: Sequence[Finding]) -> None:
     """Print an audit's findings; errors among them end the command with status 1."""
     for f in findings:
         expected = f" (expected: {f.expected})" if f.expected else ""
+        if f.check == "contact" and f.severity == "warning":
+            expected += "; press harder, and let the recording begin before the press"
         typer.echo(f"{f.severity:8} {f.check}: {f.item}: {f.measured}{expected}")
     if any(f.severity == "error" for f in findings):
         raise typer.Exit(1)
@@ -339,7 +341,7 @@ def diff(
 
 Video = Annotated[str, typer.Argument(help="A video.")]
 Another = Annotated[str, typer.Argument(help="Another one.")]
-Property = Annotated[str, typer.Argument(help="Such as hardness.")]
+Property = Annotated[str, typer.Argument(help="Such as hardness, or softer.")]
 Model = Annotated[str | None, typer.Option(help="Folder, or hf://USER/NAME[@REVISION]; by default the shipped one.")]
 Base = Annotated[
     Path | None, typer.Option(help="Folder of its language model, where no known place has it, or of one like it.")
@@ -383,10 +385,13 @@ def ask(
     elif json:
         typer.echo(dumps(answer_once(asked, question, videos or ()), ensure_ascii=False))
     else:
+        said = ""
         for piece in asked.stream(question, videos or ()):
             typer.echo(piece, nl=False)
+            said += piece
         typer.echo()
-        _print_notes(asked.notes(videos or (), question))
+        heads = asked.verdict(question, videos or ())
+        _print_notes((*asked.apart(said, heads), *asked.notes(videos or (), question)), heads.shown if heads else "")
 
 
 @app.command()
@@ -413,6 +418,7 @@ def describe(
     rows, failed = describe_folder(asked, videos, csv)
     lacking = f", {failed} of them not described (column error; delete their rows to try them again)" if failed else ""
     typer.echo(f"{csv}: {counted(rows, 'video')}{lacking}")
+    _print_notes(asked.doubts)
     if failed == rows:
         raise typer.Exit(1)
 
@@ -422,9 +428,9 @@ def compare(
     a: Video, b: Another, property: Property, model: Model = None, base: Base = None, device: Device = "auto"
 ) -> None:
     """Say whether the first video has more of a property than the second."""
-    found = _load(model, base, device).compare(a, b, property)
+    found = _load(model, base, device, property).compare(a, b, property)
     typer.echo(found.answer)
-    _print_notes(found.notes)
+    _print_notes(found.notes, found.heads)
 
 
 @app.command()
@@ -439,7 +445,7 @@ def rank(
     from pipeline.use.ask import videos_of
 
     videos = [file for file, _ in videos_of(paths)]
-    found = _load(model, base, device).rank(videos, property)
+    found = _load(model, base, device, property).rank(videos, property)
     classes = ", ".join(f"{number} {level}" for number, level in enumerate(found.levels))
     typer.echo(f"{found.property} by the property heads: {classes}")
     for place in found.order:
@@ -606,18 +612,26 @@ def demo(
     serve_demo(lambda: _load(folder, base, device), catalogue, port)
 
 
-def _print_notes(notes: Sequence[str]) -> None:
-    """Print what speaks against an answer on the error stream, each note once."""
+def _print_notes(notes: Sequence[str], heads: str = "") -> None:
+    """Print on the error stream what the property heads say, and what speaks against an answer, each note once."""
+    if heads:
+        typer.echo(f"property heads: {heads}", err=True)
     for note in dict.fromkeys(notes):
         typer.echo(f"note: {note}", err=True)
 
 
-def _load(folder: str | None, base: Path | None, device: str) -> Octopi:
+def _load(folder: str | None, base: Path | None, device: str, property: str = "") -> Octopi:
+    """Load a model; a device or a property that it does not know is refused before that takes its time."""
     from pipeline.core.runtime import DeviceName
     from pipeline.running.progress import quiet_libraries
 
     if device not in get_args(DeviceName):
         raise UserError(f"--device is {device}; allowed: {', '.join(get_args(DeviceName))}")
+    if property and not (folder or "").startswith("hf://"):
+        from pipeline.core.layout import SHIPPED
+        from pipeline.use.folder import find_property, read_folder
+
+        find_property(read_folder(Path(folder or SHIPPED))[1], property)
     quiet_libraries()
     from pipeline.use.model import Octopi
 

@@ -72,5 +72,5 @@ def reproduce(root: Path, arguments: list[str]) -> int:
         # A clone has the lock of a chain that ran elsewhere, so that DVC does not publish it; MLflow has nothing yet.
         attempt(params.tracking, publish, params)
     print(f"Report: reports/{name}/README.md; all reports on one page: reports/index.html")
-    print("Dashboard: make dashboard, then open http://127.0.0.1:5000")
+    print("Dashboard: make dashboard, then open the link to all variants that it prints after ten seconds")
     return 0

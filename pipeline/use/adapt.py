@@ -24,7 +24,7 @@ from pipeline.training.card import CARD_FILE
 from pipeline.training.embeddings import STATISTICS_FILE, Statistics
 from pipeline.use.encoding import EncodedVideo
 from pipeline.use.few_ratings import Known, Rated, Reading, on_features, read_anew, standardised
-from pipeline.use.folder import CATALOGUE, CONFIG, ENCODER_DIR, TRAINED, distance
+from pipeline.use.folder import CATALOGUE, CONFIG, ENCODER_DIR, FITTED, TRAINED, distance
 from pipeline.use.model import Octopi
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import list_videos, raise_errors
@@ -118,6 +118,7 @@ def adapt(
         raise UserError("one frame has no deviation; name more videos")
     made = _without_ratings(model, encoded) if catalogue is None else _rated(model, encoded, catalogue, objects, seed)
     update: dict[str, Any] = {"scores": {}, "temperatures": made.temperatures or config.temperatures}
+    update["trained_on"] = FITTED if catalogue is None and not config.calibrated else "videos"
     lengths = [len(video.raw) for video in encoded]
     # Rounded up to the digits that config.json keeps, so that the farthest video itself is not flagged.
     farthest = max(distance(part.double().numpy()) for part in made.features.split(lengths))

@@ -5,10 +5,12 @@ from __future__ import annotations
 import csv
 import io
 import logging
+import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from rich.markup import escape
 from rich.table import Column, Table
@@ -21,6 +23,8 @@ from pipeline.videos.decoding import SUFFIXES
 from pipeline.videos.files import video_files
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from pipeline.use.model import Octopi
 
 log = logging.getLogger(__name__)
@@ -37,18 +41,26 @@ HELP = """\
 
 def answer_once(model: Octopi, question: str, videos: Sequence[str]) -> dict[str, Any]:
     """An answer with what it stands on, for machines."""
-    answer = model.ask(question, videos)
-    looked = [model.look(video) for video in videos]
+    answer, heads = model.ask(question, videos), model.verdict(question, videos)
     return {
-        "notes": model.doubts_about(question, len(videos)),
+        "notes": (*model.apart(answer, heads), *model.doubts_about(question, len(videos))),
         "model": model.name,
         "question": question,
         "videos": [
-            {"file": video, "frames": touch.numbers, "contact": touch.contact, "notes": touch.notes}
-            for video, touch in zip(videos, looked, strict=True)
+            {"file": video, "frames": touch.numbers, "contact": touch.contact, "notes": touch.notes} | classes
+            for video, touch, classes in zip(videos, map(model.look, videos), classes_of(model, videos), strict=True)
         ],
         "answer": answer,
+        "heads": heads.shown if heads else "",
     }
+
+
+def classes_of(model: Octopi, videos: Sequence[Video]) -> list[dict[str, Any]]:
+    """For machines, what the property heads say of each video; nothing where there are none."""
+    if not model.config.heads:
+        return [{} for _ in videos]
+    wanted = {"levels", "probabilities", "calibrated"}
+    return [model.describe(video, sentence=False).model_dump(include=wanted) for video in videos]
 
 
 def lines_of_terminal() -> Iterator[str]:
@@ -132,7 +144,9 @@ class Chat:
         for piece in self.model.stream(question, self.waiting, history=self.history):
             self.say(piece)
             said += piece
-        self.say("\n")
+        heads = self.model.verdict(question, self.waiting)
+        self.say(f"\n(property heads: {heads.shown})\n" if heads else "\n")
+        self.say("".join(f"note: {note}\n" for note in self.model.apart(said, heads)))
         self.history.append(Exchange(question, tuple(self.waiting), said))
         self.waiting = []
 
@@ -148,7 +162,7 @@ def digest(file: Path) -> str:
 def named_objects(text: str) -> list[str] | dict[str, list[str]]:
     """What `--names` says: "NAME, NAME" of a catalogue, or names with classes, "NAME: CLASS, CLASS; NAME: ..."."""
     if ":" not in text:
-        return [name.strip() for name in text.split(",")]
+        return [name.strip() for name in re.split("[,;]", text) if name.strip()]
     told = [part.partition(":") for part in text.split(";") if part.strip()]
     return {name.strip(): [c.strip() for c in classes.split(",")] for name, _, classes in told}
 
@@ -163,9 +177,7 @@ def describe_folder(model: Octopi, paths: Sequence[Path], out: Path) -> tuple[in
         UserError: for a folder without videos, or a file that another model or something else wrote, or that describes
             another recording under the name of one of these.
     """
-    files, label = videos_of(paths), f"{model.name} {model.config.digest}"
-    probabilities = [f"{p.name}: {level}" for p in model.catalogue.properties for level in p.levels]
-    columns = ["file", "sha256", *model.properties, *probabilities, "sentence", "frames", "notes", "error", "model"]
+    files, (columns, label) = videos_of(paths), _columns(model)
     csv.writer(head := io.StringIO(), lineterminator="\n").writerow(columns)
     # A kill may have cut a character in two; a file that was sent may have others.
     text = out.read_text(encoding="utf-8", errors="replace") if out.is_file() else ""
@@ -195,6 +207,22 @@ def describe_folder(model: Octopi, paths: Sequence[Path], out: Path) -> tuple[in
     return len(done) + len(rest), failed
 
 
+def table(model: Octopi, paths: Sequence[Path]) -> pd.DataFrame:
+    """As `describe_folder`, in memory."""
+    import pandas as pd
+
+    files, (columns, label) = videos_of(paths), _columns(model)
+    rows = zip(files, _describe(model, files), strict=True)
+    return pd.DataFrame([{**row, "sha256": digest(file), "model": label} for (file, _), row in rows], columns=columns)
+
+
+def _columns(model: Octopi) -> tuple[list[str], str]:
+    """Columns of a description, and what the last one says of the model."""
+    probabilities = [f"{p.name}: {level}" for p in model.catalogue.properties for level in p.levels]
+    columns = ["file", "sha256", *model.properties, *probabilities, "sentence", "frames", "notes", "error", "model"]
+    return columns, f"{model.name} {model.config.digest}"
+
+
 def described(model: Octopi, paths: Sequence[Path]) -> tuple[Table, list[str]]:
     """A table for a terminal, of videos and all those of folders: each class with its probability, and the sentence.
 
@@ -205,12 +233,15 @@ def described(model: Octopi, paths: Sequence[Path]) -> tuple[Table, list[str]]:
         UserError: the first video's error, where none could be described.
     """
     files = videos_of(paths)
+    # The beginning of a path tells nobody which video it is; that of several of one name has to.
+    named = Counter(file.name for file, _ in files)
+    files = [(file, name if named[file.name] > 1 else readable(file.name)) for file, name in files]
     # Folded, since names that are cut may be those of several files.
     table = Table(*(Column(name, overflow="fold") for name in ("video", *model.properties, "in words")))
     notes, errors = [*model.doubts], list[str]()
     for row in _describe(model, files):
-        found = [(row.get(p), row.get(f"{p}: {row.get(p)}")) for p in model.properties]
-        cells = [f"{level} ({share:.0%})" if share else str(level or "") for level, share in found]
+        found = [(row.get(p), cast("float", row.get(f"{p}: {row.get(p)}", 0.0))) for p in model.properties]
+        cells = [f"{level} ({model.config.share(p)})" if p else str(level or "") for level, p in found]
         table.add_row(*map(escape, (str(row["file"]), *cells, str(row.get("sentence", "")))))
         notes += [f"{row['file']}: {row['notes']}"] if row.get("notes") else []
         errors += [str(row["error"])] if row.get("error") else []

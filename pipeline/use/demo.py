@@ -44,6 +44,8 @@ HOSTS = ["127.0.0.1", "localhost"]
 MOST_BYTES, MOST_TOUCHES = 200_000_000, 30
 """Maximum size of one video, and how many of the last touches are remembered."""
 SCENE, SCENE_FRAMES = ScenesConfig(), 60
+ASIDE = "\x1e"
+"""Ends the model's own answer, which the page sends back with the next question, in what is streamed."""
 GLOW = 6.0
 """Difference to the untouched sensor, in 8-bit steps, that is painted at full strength where it touches."""
 
@@ -119,25 +121,31 @@ class Session:
             "notes": said.notes,
             "levels": said.levels,
             "probabilities": said.probabilities,
+            "calibrated": said.calibrated,
         }
 
     async def stream(self, asked: Asked) -> AsyncIterator[str]:
-        """The answer in pieces; it stops where nobody listens any more.
+        """The answer in pieces, and behind `ASIDE` what the heads say; it stops where nobody listens any more.
 
         Raises:
             UserError: if the question does not fit, before the first piece.
         """
         turns = [Exchange(t.question, self._find(t.touches), t.answer) for t in asked.history]
         videos = self._find(asked.touches)
+        (heads,) = await self.work(lambda: [self.model.verdict(asked.question, videos)])
         pieces = self.worker.answer(lambda: self.model.stream(asked.question, videos, history=turns))
         first = await anext(pieces, "")
 
         async def rest() -> AsyncIterator[str]:
+            said = first
             async with aclosing(pieces):
                 try:
                     yield first
                     async for piece in pieces:
+                        said += piece
                         yield piece
+                    if heads:
+                        yield ASIDE + ". ".join([f"Property heads: {heads.shown}", *self.model.apart(said, heads)])
                 except (UserError, Failed) as error:
                     yield f"\n[{error}]"
 

@@ -21,8 +21,9 @@ from pipeline.config import EncoderConfig, FramesConfig, LanguageConfig
 from pipeline.core.io import fingerprint, read_json, sha256
 from pipeline.core.records import Encoder, Opd, Record, Turn
 from pipeline.language.chat import render
-from pipeline.running.errors import UserError, first_problem
-from pipeline.videos.catalogue import Catalogue
+from pipeline.running.errors import UserError, did_you_mean, first_problem
+from pipeline.videos.catalogue import Catalogue, Property
+from pipeline.videos.catalogue.wording import plain
 from pipeline.weights.make import PACKAGED, make
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ LIBRARIES = ("octopi-pipeline", "torch", "transformers", "peft", "open_clip_torc
 CONFIG, CATALOGUE = "config.json", "catalogue.json"
 ENCODER_DIR, BASE_DIR, BACKBONE_DIR = "encoder", "base", "backbone"
 TRAINED, SCENES = "encoder.safetensors", "scenes.safetensors"
+FITTED = "scenes, fitted to videos without ratings"
 IDENTITY = ("*.safetensors", "tokenizer.json")
 """Files by which a base language model is known."""
 SHAPES = ("model_type", "hidden_size", "num_hidden_layers", "num_attention_heads", "num_key_value_heads")
@@ -77,7 +79,7 @@ class ModelConfig(Record):
     opd: Opd
     """How much it was trained to describe before it concludes."""
     trained_on: str
-    """`data.source`: whether its videos were synthetic."""
+    """`data.source`: whether its videos were synthetic; `FITTED` where these were, and `octopi adapt` had real ones."""
     facts: bool
     """Whether matching questions tell it what the named objects are like."""
     names: Literal["catalogue", "number"] = "catalogue"
@@ -104,6 +106,15 @@ class ModelConfig(Record):
     """sha256 of every other file by its path."""
     versions: dict[str, str]
     """Of the libraries that it was made with."""
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether probabilities were calibrated on real videos."""
+        return self.trained_on not in ("scenes", FITTED)
+
+    def share(self, probability: float) -> str:
+        """A probability of the heads; as a percentage only where it is calibrated."""
+        return f"{probability:.0%}" if self.calibrated else f"score {probability:.2f}"
 
     @property
     def digest(self) -> str:
@@ -198,6 +209,22 @@ def chat_sample(tokenizer: PreTrainedTokenizerBase, language: LanguageConfig) ->
     turns = [Turn(user="a {tactile}", assistant="b"), Turn(user="c", assistant="d")]
     system, chat = language.system_prompt, language.chat
     return render(turns, tokenizer, system_prompt=system, frames=1, complete=True, chat=chat).text
+
+
+def find_property(catalogue: Catalogue, word: str) -> tuple[Property, bool]:
+    """The property that a word names ("hardness", "softer", "hardest"), and whether its high classes are meant.
+
+    Raises:
+        UserError: for any other word.
+    """
+    known: dict[str, tuple[Property, bool]] = {}
+    for p in catalogue.properties:
+        high, low = (p.name, p.spoken, p.more, p.most), (p.less, p.least)
+        known |= dict.fromkeys(map(plain, high), (p, True)) | dict.fromkeys(map(plain, low), (p, False))
+    if found := known.get(plain(word)):
+        return found
+    words = ", ".join(f"{p.name} ({p.more}, {p.less})" for p in catalogue.properties)
+    raise UserError(f"{word}: no property of this model; {did_you_mean(word.lower(), known)}it knows {words}")
 
 
 def distance(standardised: npt.NDArray[np.float64]) -> float:

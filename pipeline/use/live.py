@@ -131,11 +131,17 @@ def run(model: Octopi, camera: str, question: str, say: Callable[[str], object],
         rate = f"{(len(press) - 1) / seconds:.1f} a second" if seconds > 0 else "at once"
         try:
             if question:
-                said, notes = model.ask(question, [video]), model.notes([video], question)
+                said, heads = model.ask(question, [video]), model.verdict(question, [video])
+                notes = (*model.apart(said, heads), *model.notes([video], question))
+                said += f" (property heads: {heads.shown})" if heads else ""
             else:
                 found = model.describe(video)
                 known = found.probabilities
-                shares = {name: f" ({known[name][level]:.0%})" for name, level in found.levels.items() if name in known}
+                shares = {
+                    name: f" ({model.config.share(known[name][level])})"
+                    for name, level in found.levels.items()
+                    if name in known
+                }
                 levels = (f"{name} {level}{shares.get(name, '')}" for name, level in found.levels.items())
                 said, notes = "; ".join([*levels, found.sentence]), found.notes
         except UserError as error:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 import os
 import random
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import torch
+from huggingface_hub import ModelCardData
 
 from pipeline.config import LANGUAGE_DIR, LanguageConfig
 from pipeline.core.io import fingerprint
@@ -24,21 +26,44 @@ from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.running.errors import UserError, counted, did_you_mean, readable
 from pipeline.running.progress import quiet_libraries
 from pipeline.tasks import opd, pc, pom, psr, pss
-from pipeline.tasks.base import LETTERS
+from pipeline.tasks.base import LETTERS, conclusion
+from pipeline.training.card import front_matter
 from pipeline.use.encoding import Classified, EncodedVideo, VideoEncoder
-from pipeline.use.folder import ENCODER_DIR, ModelConfig, chat_sample, find_base, read_folder
+from pipeline.use.folder import ENCODER_DIR, FITTED, ModelConfig, chat_sample, find_base, find_property, read_folder
+from pipeline.use.frames import name_of
 from pipeline.use.hub import HUB, download
 from pipeline.use.memory import Remembered, most_similar, recall, remember
-from pipeline.use.results import Choice, Comparison, Description, Exchange, Matching, Ranking, Recognition, Touch, Video
-from pipeline.videos.catalogue import Catalogue, Object, Property
+from pipeline.use.results import (
+    Choice,
+    Comparison,
+    Description,
+    Exchange,
+    Matching,
+    Ranking,
+    Recognition,
+    Touch,
+    Verdict,
+    Video,
+)
+from pipeline.videos.catalogue import Catalogue, Object
+from pipeline.videos.catalogue.wording import mentioned
+from pipeline.videos.files import video_files
 from pipeline.weights import is_random
 from pipeline.weights.backbones import reads_weights
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 NUMBERED = re.compile(r"object \d+")
 ALONE = "the question compares, but there is one video: what it says of another is made up"
 APART = "the sentence and the property heads disagree; heads alone are right more often (the card has both)"
 MUTE = "its language model knows other properties and is not asked; property heads alone answer"
 RANDOM = "its base models are tiny and random, made to test the chain: no answer of it means anything"
+
+SYNTHETIC = "it was trained on synthetic touches alone; adapt it to your sensor with ratings (docs/use.md); "
+UNRATED = "it was trained on synthetic touches, and fitted to a sensor without ratings: nobody measured what it reaches"
+REAL = "real-tactile-videos"
+"""Type of the data that a card's results on real videos, none of which was trained on, are listed under."""
 
 logger = logging.getLogger(__name__)
 
@@ -71,6 +96,8 @@ class Octopi:
         self._encoder_name = fingerprint(config.frames, *(part for file in files for part in file))
         bases = (config.base.folder, *([config.encoder.weights] if reads_weights(config.encoder) else []))
         self.doubts: tuple[str, ...] = (RANDOM,) if any(map(is_random, bases)) else ()
+        if not config.calibrated:
+            self.doubts += (UNRATED if config.trained_on == FITTED else SYNTHETIC + on_real_videos(folder),)
 
     def __repr__(self) -> str:
         scores = ", ".join(f"{task} {100 * accuracy:.0f} %" for task, (accuracy, *_) in self.config.scores.items())
@@ -196,6 +223,45 @@ class Octopi:
         compares = any(word in question.lower() for word in ("which", *words))
         return (*self.doubts, *((ALONE,) if compares and videos == 1 else ()))
 
+    def verdict(self, question: str, videos: Video | Sequence[Video] = ()) -> Verdict | None:
+        """What the heads say to a question; None where there are none, or no rule leads from them to an answer.
+
+        One video is described; two or three are compared where the question names one property, as "softer" does.
+        """
+        files, properties = _listed(videos), self.catalogue.properties
+        asked = mentioned(question, (word for p in properties for word in (p.more, p.less, p.most, p.least)))
+        if not self.config.heads or (len(files), len(asked)) not in ((1, 0), (2, 1), (3, 1)):
+            return None
+        if not asked:
+            found = self.encoder.classify(files[0])
+            each = zip(properties, found.levels, found.probabilities, strict=True)
+            told = (f"{p.levels[level]} ({self.config.share(known[level])})" for p, level, known in each)
+            return Verdict(self.catalogue.structured(found.levels), ", ".join(told))
+        known, rising = find_property(self.catalogue, asked[0])
+        classes = [self._classes(video)[self.properties.index(known.name)] for video in files]
+        if len(files) == 2:
+            choice = pc.compare(classes[0][0], classes[1][0], rising)
+            # As "Which is softer?" is answered: without a Yes or No.
+            said = re.sub("^(Yes|No), the", "The", pc.in_words(choice, known.more if rising else known.less, known))
+        else:
+            place = (max if rising else min)(range(3), key=classes.__getitem__)
+            said = f"{LETTERS[place]}) is the {known.most if rising else known.least}."
+        told = (f"{known.levels[level]} ({value:.2f})" for level, value in classes)
+        return Verdict(said, f"{known.spoken} {', '.join(told)}, from 0 to {len(known.levels) - 1}: {said}")
+
+    def apart(self, answer: str, heads: Verdict | None) -> tuple[str, ...]:
+        """A note where an answer, as far as it can be read, says something else than the heads."""
+        if heads is None:
+            return ()
+        said, ruled = self._read(answer), self._read(heads.said)
+        return (APART,) if any(ruled.get(key, value) != value for key, value in said.items()) else ()
+
+    def _read(self, answer: str) -> dict[str, str]:
+        """The classes that an answer closes with, and the video that it chooses."""
+        named = mentioned(" ".join(conclusion(answer)), ("first", "second", "both"))
+        choice = named[0] if len(named) == 1 else pss.read(answer)
+        return opd.named(answer, self.catalogue) | ({"choice": choice} if choice else {})
+
     # ---- the tasks ----
 
     def describe(self, video: Video, *, sentence: bool = True) -> Description:
@@ -206,8 +272,9 @@ class Octopi:
         """
         return self.describe_all([video], sentence=sentence)[0]
 
-    def describe_all(self, videos: Sequence[Video], *, sentence: bool = True) -> list[Description]:
-        """As `describe`, of many videos in one batch. A video without contact is described with a note."""
+    def describe_all(self, videos: Video | Sequence[Video], *, sentence: bool = True) -> list[Description]:
+        """As `describe`, of many videos, or those of a folder, in one batch; one without contact has a note."""
+        videos = _listed(videos)
         described, asked = [], []
         heads, tells = self.config.heads, self.config.opd is not Opd.NONE and self.config.speaks
         doubts: tuple[str, ...] = ()
@@ -222,6 +289,8 @@ class Octopi:
             encoded, classified = self.encoder.encode(video), self.encoder.classify(video) if heads else Classified()
             each = list(zip(self.catalogue.properties, classified.probabilities, classified.levels, strict=heads))
             description = Description(
+                video=encoded.name,
+                calibrated=self.config.calibrated,
                 levels={p.name: p.levels[level] for p, _, level in each},
                 probabilities={p.name: dict(zip(p.levels, found, strict=True)) for p, found, _ in each},
                 sentence="",
@@ -233,28 +302,43 @@ class Octopi:
                 asked.append(self._prompt(opd.TEMPLATES[0], video, untouched=True))
         said = self._reply(asked, None) or [""] * len(videos)
         for place, text in enumerate(said):
-            named = {} if heads else opd.named(text, self.catalogue)
-            described[place] = described[place].model_copy(
-                update={"sentence": text} | ({"levels": named} if named else {})
-            )
+            named, found = opd.named(text, self.catalogue), described[place]
+            update: dict[str, object] = {"sentence": text} | ({"levels": named} if named and not heads else {})
+            if any(found.levels.get(name, level) != level for name, level in named.items()):
+                update["notes"] = (*found.notes, APART)
+            described[place] = found.model_copy(update=update)
         return described
 
-    def compare(self, a: Video, b: Video, property: str) -> Comparison:
-        """Whether the first video is more of a property than the second, in the wording of training."""
-        known = self._property(property)
-        question = pc.asked(pc.TEMPLATES[0], known.more, known.spoken)[self.config.opd]
-        answer = self.ask(question, [a, b])
-        return Comparison(question=question, answer=answer, choice=pc.read(answer), notes=self.notes([a, b]))
+    def table(self, videos: Path | str | Sequence[Path | str]) -> pd.DataFrame:
+        """Descriptions of videos, or of those of folders: the table that `octopi describe --csv` writes."""
+        # Named, not imported: the stage `evaluate` imports this file, and makes no such table.
+        listed = importlib.import_module("pipeline.use.ask")
+        found: pd.DataFrame = listed.table(
+            self, [Path(v) for v in ([videos] if isinstance(videos, (str, Path)) else videos)]
+        )
+        return found
 
-    def rank(self, videos: Sequence[Video], property: str) -> Ranking:
+    def compare(self, a: Video, b: Video, property: str) -> Comparison:
+        """Whether the first video is more of a property ("hardness", "harder") than the second, or less ("softer")."""
+        known, rising = find_property(self.catalogue, property)
+        question = pc.asked(pc.TEMPLATES[0], known.more if rising else known.less, known.spoken)[self.config.opd]
+        answer = self.ask(question, [a, b])
+        ruled = self.verdict(question, [a, b])
+        notes, heads = (*self.apart(answer, ruled), *self.notes([a, b])), ruled.shown if ruled else ""
+        return Comparison(question=question, answer=answer, choice=pc.read(answer), heads=heads, notes=notes)
+
+    def rank(self, videos: Video | Sequence[Video], property: str) -> Ranking:
         """Videos by a property, least first: by the heads, and the model's own answer for two or three.
+
+        By "softer" or "softest" in place of "hardness", the hardest is first.
 
         Raises:
             UserError: for fewer than two videos, or one in which nothing is touched.
         """
+        videos = _listed(videos)
         if len(videos) < 2:
             raise UserError(f"{counted(len(videos), 'video')}: two or more can be ranked")
-        known = self._property(property)
+        known, rising = find_property(self.catalogue, property)
         place = self.properties.index(known.name)
         expected: list[float] = []
         notes: list[str] = []
@@ -266,18 +350,20 @@ class Octopi:
         if not self.config.speaks:
             notes.append(MUTE)
         elif len(videos) == 3:
-            answer = self.ask(pss.asked(pss.TEMPLATES[0], known.most, known.spoken)[self.config.opd], videos)
+            superlative = known.most if rising else known.least
+            answer = self.ask(pss.asked(pss.TEMPLATES[0], superlative, known.spoken)[self.config.opd], videos)
             letter = pss.read(answer)
             most = None if letter is None else LETTERS.index(letter)
         elif len(videos) == 2:
             compared = self.compare(videos[0], videos[1], property)
             answer, most = compared.answer, {"yes": 0, "no": 1}.get(compared.choice or "")
-        order = sorted(range(len(videos)), key=expected.__getitem__)
+        order = sorted(range(len(videos)), key=lambda i: expected[i] if rising else -expected[i])
         if most is not None and most != order[-1]:
             notes.append(APART)
         return Ranking(
             property=known.name,
             levels=known.levels,
+            videos=tuple(map(name_of, videos)),
             order=tuple(order),
             expected=tuple(expected),
             answer=answer,
@@ -447,22 +533,30 @@ class Octopi:
                 return known[key]
         hint = did_you_mean(name.lower(), known)
         raise UserError(
-            f"{name}: the model's catalogue has no such object; {hint}tell what it is like ({self._example()})"
+            f"{name}: the model's catalogue has no such object; {hint}write what each is like, one class of every "
+            f"property ({self._example(name)}; ...)"
         )
 
-    def _example(self) -> str:
-        return "NAME: " + ", ".join("|".join(p.levels) for p in self.catalogue.properties)
+    def _example(self, name: str = "NAME") -> str:
+        return f"{name}: " + ", ".join("|".join(p.levels) for p in self.catalogue.properties)
 
-    def _property(self, name: str) -> Property:
-        for known in self.catalogue.properties:
-            if name.lower() in (known.name, known.spoken):
-                return known
-        hint = did_you_mean(name.lower(), self.properties)
-        raise UserError(f"{name}: no property of this model; {hint}it knows {', '.join(self.properties)}")
+
+def on_real_videos(folder: Path) -> str:
+    """How many of real videos, which it was not trained on, a model describes right, by its card."""
+    results = ModelCardData(ignore_metadata_errors=True, **front_matter(folder)).eval_results or []
+    for r in results:
+        if r.dataset_type == REAL and r.dataset_config == "OPD" and r.metric_args:
+            right, low, high, chance = (
+                100 * x for x in (r.metric_value, *(r.metric_args[key] for key in ("low", "high", "chance")))
+            )
+            return f"of real videos it describes {right:.1f} % [{low:.1f}, {high:.1f}] right (guessing {chance:.1f} %)"
+    return "what it reaches on real videos was not measured"
 
 
 def _listed(videos: Video | Sequence[Video]) -> tuple[Video, ...]:
-    """One video as a list of one."""
+    """One video as a list of one, and a folder as all of its videos."""
+    if isinstance(videos, (str, os.PathLike)) and os.path.isdir(videos):
+        return tuple(video_files(Path(videos))[0])
     alone = isinstance(videos, (str, os.PathLike)) or (isinstance(videos, np.ndarray) and videos.ndim == 4)
     return (videos,) if alone else tuple(videos)  # type: ignore[arg-type, return-value]
 

@@ -12,6 +12,7 @@ from pydantic import AliasChoices, BaseModel, BeforeValidator, Field, Validation
 
 from pipeline.language.chat import TACTILE
 from pipeline.running.errors import UserError, first_problem
+from pipeline.use.results import Verdict
 
 MESSAGES, CHARACTERS = 64, 20_000
 """The longest conversation, and the longest text of one part of it."""
@@ -120,11 +121,14 @@ class Reply:
     """The answer to one request, in OpenAI's form; token counts are left out, since the model hands out text.
 
     `finish_reason` is `stop` even where an answer was cut at its maximum length, which the text does not show. `notes`,
-    an addition to OpenAI's form, says what should make one doubt the answer; in a stream the last chunk has it.
+    an addition to OpenAI's form, says what should make one doubt the answer, `heads` what the property heads say to the
+    question, and `touches` their probabilities for each of its videos; in a stream the last chunk has them.
     """
 
     def __init__(self, model: str) -> None:
         self.notes: list[str] = []
+        self.verdict: Verdict | None = None
+        self.touches: list[Json] = []
         self.head: Json = {"id": f"chatcmpl-{uuid.uuid4().hex}", "created": int(time.time()), "model": model}
 
     def whole(self, text: str) -> Json:
@@ -135,5 +139,6 @@ class Reply:
     def chunk(self, said: Mapping[str, str | None], finish: str | None = None, called: str = "delta") -> Json:
         """A `chat.completion.chunk`."""
         choice = {"index": 0, called: said, "logprobs": None, "finish_reason": finish}
-        notes = {"notes": self.notes} if finish else {}
-        return {**self.head, "object": "chat.completion.chunk", "choices": [choice], **notes}
+        heads = self.verdict.shown if self.verdict else ""
+        more = {"notes": self.notes, "heads": heads, "touches": self.touches} if finish else {}
+        return {**self.head, "object": "chat.completion.chunk", "choices": [choice], **more}

@@ -17,6 +17,15 @@ Video = str | os.PathLike[str] | Pictures
 """A file, or uint8, frames x height x width x RGB."""
 
 
+class Verdict(NamedTuple):
+    """What follows from the property heads by a plain rule, without the language model."""
+
+    said: str
+    """Worded as a right answer is."""
+    shown: str
+    """With the classes, and their probabilities or expected classes."""
+
+
 class Exchange(NamedTuple):
     """One turn of a conversation. The caller keeps the list of them; the model remembers nothing."""
 
@@ -49,11 +58,15 @@ class Touch(Record):
 class Description(Record):
     """What the property heads and the language model say of one video."""
 
+    video: str = ""
+    """Its name, as notes have it."""
     levels: dict[str, str]
     """By property, the class that the heads choose. Where the encoder's recipe decides on all jointly, by which classes
     occur together in training, it need not be the likeliest class of that property alone."""
     probabilities: dict[str, dict[str, float]]
-    """By property, the heads' calibrated probability of each class."""
+    """By property, the heads' probability of each class."""
+    calibrated: bool = True
+    """Whether these were calibrated on real videos; else they are scores that are mostly too sure."""
     sentence: str
     """The model's own description; empty where its variant never learnt to describe."""
     frames: tuple[int, ...]
@@ -68,6 +81,8 @@ class Comparison(Record):
     answer: str
     choice: Literal["yes", "no", "same"] | None
     """None where the answer cannot be read."""
+    heads: str
+    """What the property heads say, by a plain rule; empty where there are none."""
     notes: tuple[str, ...]
     """What should make one doubt it: of the model, then of each video, after its name."""
 
@@ -78,6 +93,8 @@ class Ranking(Record):
     property: str
     levels: tuple[str, ...]
     """The property's classes, least first."""
+    videos: tuple[str, ...]
+    """Their names, in the order that they were given in."""
     order: tuple[int, ...]
     """Places in the list of videos, from 0, by the heads' expected class, smallest first."""
     expected: tuple[float, ...]

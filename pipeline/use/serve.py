@@ -22,6 +22,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
 from pipeline.running.errors import UserError
+from pipeline.use.ask import classes_of
 from pipeline.use.media import PLACE, Gate
 from pipeline.use.protocol import Json, Reply, read_conversation, read_request
 from pipeline.use.results import Exchange
@@ -65,7 +66,7 @@ def read_token(file: Path | None) -> str:
     return token
 
 
-async def _events(reply: Reply, first: str, pieces: AsyncGenerator[str]) -> AsyncIterator[str]:
+async def _events(model: Octopi, reply: Reply, first: str, pieces: AsyncGenerator[str]) -> AsyncIterator[str]:
     """Server-sent events as OpenAI sends them; an error that comes late is the last event."""
 
     def event(value: Json) -> str:
@@ -76,7 +77,9 @@ async def _events(reply: Reply, first: str, pieces: AsyncGenerator[str]) -> Asyn
             yield event(reply.chunk({"role": "assistant", "content": ""}))
             yield event(reply.chunk({"content": first}))
             async for piece in pieces:
+                first += piece
                 yield event(reply.chunk({"content": piece}))
+            reply.notes += model.apart(first, reply.verdict)
             yield event(reply.chunk({}, "stop")) + "data: [DONE]\n\n"
         except (UserError, Failed) as error:
             yield event(_error(error)[0])
@@ -173,19 +176,22 @@ def make_app(model: Octopi, name: str, *, token: str = "", places: int = 32) -> 
             tokens = min(most, MOST_TOKENS) if most else None
             pieces = model.stream(last.question, last.videos, history=history, max_new_tokens=tokens)
             reply.notes = [PLACE.sub(r"video \1", note) for note in model.notes(paths, last.question)]
+            reply.verdict = model.verdict(last.question, last.videos)
+            reply.touches = classes_of(model, last.videos)
             return pieces
 
         pieces = worker.answer(ask)
         if wanted.stream:
             # What fails before the first piece has a status of its own.
             first = await anext(pieces, "")
-            return StreamingResponse(_events(reply, first, pieces), media_type="text/event-stream")
+            return StreamingResponse(_events(model, reply, first, pieces), media_type="text/event-stream")
         text = ""
         async with aclosing(pieces):
             async for piece in pieces:
                 text += piece
                 if await request.is_disconnected():
                     raise ClientDisconnect
+        reply.notes += model.apart(text, reply.verdict)
         return JSONResponse(reply.whole(text))
 
     @app.get("/v1/models", dependencies=guarded)

@@ -21,7 +21,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 @pytest.fixture(scope="session")
 def octopi(made: Made) -> Octopi:
-    return Octopi.from_pretrained(made.folder, device="cpu")
+    """As one whose videos, which are files here, are a real sensor's."""
+    model = Octopi.from_pretrained(made.folder, device="cpu")
+    config = model.config.model_copy(update={"trained_on": "videos"})
+    return Octopi(made.folder, config, model.catalogue, model.llm, model.encoder.device)
 
 
 @pytest.fixture

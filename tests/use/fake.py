@@ -10,13 +10,14 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from pipeline.config import FramesConfig
 from pipeline.running.errors import UserError
 from pipeline.use.frames import read_touch
 from pipeline.use.model import with_marks
-from pipeline.use.results import Description, Touch, Video
+from pipeline.use.results import Description, Touch, Verdict, Video
 from pipeline.use.server import listen, make_server
 from tests.conftest import HUNG
 from tests.use.videos import uri
@@ -37,6 +38,7 @@ class FakeOctopi:
     """
 
     name = "finetuned-with-all-0"
+    config = SimpleNamespace(heads=True)
 
     def __init__(self, seconds: float = 0.0) -> None:
         self.seconds = seconds
@@ -54,6 +56,12 @@ class FakeOctopi:
         share = {p: {level: 1 / 2 ** (i + 1) for i, level in enumerate(names)} for p, names in LEVELS.items()}
         levels = {p: names[0] for p, names in LEVELS.items()}
         return Description(levels=levels, probabilities=share, sentence="It is soft.", frames=(1, 2), notes=())
+
+    def verdict(self, question: str, videos: Sequence[Any]) -> Verdict | None:
+        return Verdict("soft", "soft (50%)") if videos else None
+
+    def apart(self, answer: str, heads: Verdict | None) -> tuple[str, ...]:
+        return ("the sentence and the heads disagree",) if heads and "soft" not in answer else ()
 
     def notes(self, videos: Sequence[Any], question: str = "") -> tuple[str, ...]:
         """As the real one's: behind the name of a file."""

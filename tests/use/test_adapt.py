@@ -14,7 +14,7 @@ from pipeline.core.io import read_json
 from pipeline.use.adapt import adapt, rated_videos
 from pipeline.use.few_ratings import Known, Rated, Way, fit, read_anew, standardised
 from pipeline.use.folder import CONFIG, find_base, read_folder
-from pipeline.use.model import Octopi
+from pipeline.use.model import UNRATED, Octopi
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from tests.checkpoints import edit
 from tests.closure import ROOT
@@ -92,6 +92,8 @@ def test_without_ratings_embeddings_and_heads_are_standardised(octopi: Octopi, t
             pooled = logsumexp(log_softmax(own.numpy(), axis=1), axis=0) / temperature
             np.testing.assert_allclose(probabilities, np.exp(log_softmax(pooled)), atol=2e-3)
     assert not mine.config.scores, "they were another's"
+    assert (octopi.config.calibrated, mine.config.calibrated) == (False, False)
+    assert mine.doubts == (UNRATED,)
     assert mine.ask("Is it soft?", VIDEOS[0])
     with refused("is there already"):
         adapt(octopi, VIDEOS, tmp_path / "mine")
@@ -119,6 +121,7 @@ def test_with_ratings_heads_know_them(octopi: Octopi, catalogue: Catalogue, tmp_
     told = adapt(octopi, [*found], tmp_path / "mine", catalogue=ratings, objects=[*found.values()])
     assert "3 rated objects (6 videos)" in told
     mine = Octopi.from_pretrained(tmp_path / "mine", base=model_folder("smollm2"), dtype="float32")
+    assert (mine.doubts, mine.config.calibrated) == ((), True)
     described = mine.describe(VIDEOS[0])
     right = [p.levels[level] for p, level in zip(ratings.properties, ratings.labels(names[0]), strict=True)]
     assert not other or list(described.levels.values()) == right

@@ -15,7 +15,7 @@ from typer.testing import CliRunner, Result
 from pipeline.cli import app, main
 from pipeline.running import progress
 from pipeline.use import ask as asking
-from pipeline.use.ask import Chat, describe_folder
+from pipeline.use.ask import Chat, describe_folder, described
 from pipeline.use.model import Octopi
 from tests.conftest import not_utf8, refused
 from tests.report.shared import rows_of
@@ -77,7 +77,9 @@ def test_a_chat(octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPat
     assert "nothing.avi: no such file" in type_("/add nothing.avi")
     assert "2 {tactile} for 1 video;" in type_("Is {tactile} softer than {tactile}?"), "the chat goes on"
     first = octopi.ask("{tactile} How soft is it?", files[:1])
-    assert type_("How soft is it?") == first + "\n", "without marks they stand in front"
+    said_first, heads = type_("How soft is it?").split("\n(property heads: ")
+    assert said_first == first, "without marks they stand in front"
+    assert all(level in heads for level in octopi.describe(files[0]).levels.values())
     assert type_("And now?") == octopi.ask("And now?", history=chat.history[:1]) + "\n"
     assert [len(e.videos) for e in chat.history] == [1, 0]
     numbers = ", ".join(map(str, octopi.look(files[0]).numbers))
@@ -100,7 +102,7 @@ def test_a_chat_mixes_no_recordings_of_one_name(octopi: Octopi, files: list[Path
     chat.run([f"/add {touch}", "And now?", "/reset", f"/add {touch}", "How soft is it?"])
     changed = f"{touch} has changed since it was added; name the new one otherwise, or /reset"
     assert [line for line in "".join(said).split("\n") if "changed" in line] == [changed] * 2
-    assert "".join(said).endswith(octopi.ask("{tactile} How soft is it?", files[1:2]) + "\n")
+    assert f"\n{octopi.ask('{tactile} How soft is it?', files[1:2])}\n(property heads: " in "".join(said)
 
 
 @pytest.fixture
@@ -132,6 +134,7 @@ def test_a_folder_is_described(
         for name, known in expected.probabilities.items():
             assert {level: float(row[f"{name}: {level}"]) for level in known} == pytest.approx(known, abs=1e-4)
         assert row["error"] == ""
+    assert octopi.table(folder).to_csv(index=False) == (tmp_path / "out.csv").read_text()
 
 
 def test_names_that_are_no_text_are_described_once(
@@ -158,6 +161,22 @@ def test_described_by_command(by_command: Command, folder: Path, files: list[Pat
     by_command("describe", broken, status=1)
 
 
+def test_a_row_of_the_table_has_its_files_name(octopi: Octopi, files: list[Path], tmp_path: Path) -> None:
+    """Those of two that are called alike have what tells them apart."""
+    table, _ = described(octopi, [*files[:2], twin := Path(shutil.copy(files[1], tmp_path))])
+    assert [*table.columns[0].cells] == [files[0].name, str(files[1]), str(twin)]
+
+
+def test_an_unknown_property_is_refused_before_a_model_is_loaded(
+    made: Made, files: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Octopi, "from_pretrained", lambda *_, **__: pytest.fail("loaded"))
+    for words in (("compare", *files[:2], "softness"), ("rank", "softness", *files[:2])):
+        found = CliRunner().invoke(app, [*map(str, words), "--model", str(made.folder)])
+        assert "softness: no property of this model; " in str(found.exception)
+        assert "hardness (harder, softer)" in str(found.exception)
+
+
 def test_described_compared_ranked_and_matched_by_command(
     by_command: Command, octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -181,7 +200,7 @@ def test_described_compared_ranked_and_matched_by_command(
     assert scale.endswith("0 smooth, 1 slightly rough, 2 rough")
     own = {"mug": ["hard", "smooth", "no bumps"], "rug": ["soft", "rough", "no bumps"]}
     typed = "mug: hard, smooth, no bumps; rug: soft, rough, no bumps"
-    for named, given in (("rug, millet", ["rug", "millet"]), (typed, own)):
+    for named, given in (("rug, millet", ["rug", "millet"]), ("rug; millet", ["rug", "millet"]), (typed, own)):
         matched = octopi.match([one, two], given)
         *lines, answer = said("match", one, two, "--names", named).rstrip("\n").split("\n")
         assert answer == matched.answer

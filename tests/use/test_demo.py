@@ -17,7 +17,7 @@ import pytest
 
 from pipeline.core.records import GAIN, MIDDLE
 from pipeline.scenes.recipe import load_recipes
-from pipeline.use.demo import GLOW, MOST_TOUCHES, Asked, Session, Turn, make_app, where
+from pipeline.use.demo import ASIDE, GLOW, MOST_TOUCHES, Asked, Session, Turn, make_app, where
 from pipeline.use.model import Octopi
 from pipeline.use.results import Exchange
 from pipeline.use.server import Failed
@@ -87,7 +87,9 @@ def test_an_answer_streams_with_its_history(site: str, session: Session, tmp_pat
         assert next(pieces) == "And ", "the first piece comes while the model goes on"
         model.gate.set()
         rest = f"{{tactile}} | {{tactile}}?>Soft.:{digest(videos[0])} | {digest(videos[1])} "
-        assert "".join(pieces) == rest
+        answer, heads = "".join(pieces).split(ASIDE)
+        assert answer == rest
+        assert heads == "Property heads: soft (50%). the sentence and the heads disagree"
     assert len(model.threads - {threading.get_ident()}) == 1, "one thread does all that the model does"
     model.gate = None
 
@@ -105,7 +107,7 @@ def test_an_answer_that_nobody_hears_ends(site: str, session: Session) -> None:
 
 def said(session: Session, **asked: Any) -> str:
     async def whole() -> str:
-        return "".join([piece async for piece in await session.stream(Asked(**asked))])
+        return "".join([piece async for piece in await session.stream(Asked(**asked))]).split(ASIDE)[0]
 
     return asyncio.run(whole())
 
@@ -205,6 +207,8 @@ def test_in_a_browser(site: str, tmp_path: Path) -> None:
         asked = "{tactile} {tactile} Which is <b>softer</b>?"
         answer = f"{asked} | {digest(files[0])} | {digest(files[1])} "
         assert said == [asked, answer], "an answer is text, too"
+        heads = page.run("document.querySelector('.model + .heads').textContent")
+        assert heads == "Property heads: soft (50%)", "no part of the answer"
         page.type("#question", "Why?")
         page.until("document.querySelectorAll('.model').length === 2 && !document.querySelector('#send').disabled")
         shown = page.run("[...document.querySelectorAll('.model')].at(-1).textContent")

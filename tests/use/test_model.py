@@ -15,7 +15,7 @@ from pipeline.core.records import Encoder, Lora, Opd, Part, Variant
 from pipeline.encoder.timm_backbone import STAGES
 from pipeline.use import encoding
 from pipeline.use import model as model_code
-from pipeline.use.encoding import VideoEncoder
+from pipeline.use.encoding import Classified, VideoEncoder
 from pipeline.use.frames import read_touch
 from pipeline.use.memory import TOUCHES
 from pipeline.use.model import Octopi
@@ -77,6 +77,7 @@ def test_a_batch_answers_as_one_by_one(octopi: Octopi, files: list[Path]) -> Non
     assert octopi.ask_all(asked) == [octopi.ask(*a) for a in asked]
     described = octopi.describe_all(files)
     assert described == [octopi.describe(f) for f in files]
+    assert [d.video for d in octopi.describe_all(files[0].parent)] == sorted(map(str, files[0].parent.iterdir()))
     assert all(d.sentence for d in described)
     short = octopi.describe_all(files, sentence=False)
     assert short == [d.model_copy(update={"sentence": ""}) for d in described]
@@ -150,6 +151,11 @@ def test_typed_tasks(octopi: Octopi, files: list[Path], monkeypatch: pytest.Monk
     assert sorted(ranked.order) == [0, 1, 2]
     assert [ranked.expected[i] for i in ranked.order] == sorted(ranked.expected)
     assert octopi.rank(files[:2], "hardness").most == 1
+    said["Is the object"] = "Conclusion: Yes, the first object is softer."
+    softer = octopi.compare(files[0], files[1], "softer")
+    assert (softer.choice, "softer than" in softer.question) == ("yes", True)
+    softest = octopi.rank(files[:2], "softest")
+    assert (softest.order, softest.most) == (octopi.rank(files[:2], "hardness").order[::-1], 0)
     assert octopi.rank([*files, files[0]], "hardness").answer == ""
     matched = octopi.match(files, names)
     assert matched.names == (names[0], names[2], names[1])
@@ -173,6 +179,69 @@ def test_typed_tasks(octopi: Octopi, files: list[Path], monkeypatch: pytest.Monk
     chosen = octopi.scenario("I must sleep.", files[:2])
     assert chosen.choice == 1
     assert [call.args[0].count("{tactile}") for call in ask.mock_calls[-2:]] == [2, 0], "described first"
+
+
+ONE, TWO = (0.7, 0.2, 0.1), (0.2, 0.6, 0.2)
+OVERALL = "Overall, it presents a {} and rough surface with big bumps."
+SAYS = (
+    # Class and probabilities of each video's hardness, a question, what follows; an answer that says it, and another.
+    ([(0, ONE), (1, TWO)], "Which is softer?", "0.40.*1.00.*first object is softer", "So the first one.", "Both."),
+    (
+        [(0, ONE), (1, TWO)],
+        "Is {tactile} harder than {tactile}?",
+        "second object is harder",
+        "No, the second.",
+        "Both.",
+    ),
+    (
+        [(1, ONE), (1, TWO)],
+        "Which is harder?",
+        "0.40.*1.00.*Both objects are similar",
+        "Both.",
+        "The second is harder.",
+    ),
+    ([(0, ONE), (1, TWO), (1, ONE)], "Which is the hardest?", r"b\) is the hardest", "b) is the hardest.", "c)"),
+    ([(0, TWO)], "How does it feel?", r"soft \(20%\)", OVERALL.format("soft"), OVERALL.format("hard")),
+    ([(0, TWO)], "Is it softer?", None, "Yes.", "No."),
+    ([(0, ONE), (1, TWO)], "Which is softer, or rougher?", None, "The first.", "The second."),
+)
+
+
+@pytest.mark.parametrize(("each", "question", "shown", "same", "other"), SAYS)
+def test_what_the_heads_say_stands_beside_an_answer(
+    each: list[tuple[int, tuple[float, ...]]],
+    question: str,
+    shown: str | None,
+    same: str,
+    other: str,
+    octopi: Octopi,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = {str(n): Classified((p, ONE, TWO), (level, 2, 2)) for n, (level, p) in enumerate(each)}
+    monkeypatch.setattr(octopi.encoder, "classify", found.__getitem__)
+    heads = octopi.verdict(question, [*found])
+    assert (heads is None) == (shown is None)
+    if heads and shown:
+        assert re.search(shown, heads.shown)
+        assert octopi.apart(other, heads) == (model_code.APART,)
+    assert octopi.apart(same, heads) == octopi.apart("I cannot say.", heads) == ()
+
+
+def test_a_model_of_synthetic_touches_says_so_on_every_answer(octopi: Octopi, made: Made, files: list[Path]) -> None:
+    def of(source: str) -> Octopi:
+        config = octopi.config.model_copy(update={"trained_on": source})
+        return Octopi(made.folder, config, octopi.catalogue, octopi.llm, octopi.encoder.device)
+
+    synthetic = of("scenes")
+    (note,) = synthetic.doubts
+    assert "synthetic touches alone" in note
+    assert "was not measured" in note, "its card has no figures of real videos"
+    assert note in synthetic.describe(files[0], sentence=False).notes
+    assert note in synthetic.compare(*files[:2], "hardness").notes
+    shown = synthetic.verdict("How is it?", files[0])
+    assert shown
+    assert re.fullmatch(r"[^%]*score 0\.\d\d[^%]*", shown.shown)
+    assert of("videos").doubts == ()
 
 
 @pytest.mark.parametrize(
@@ -216,7 +285,7 @@ def test_videos_that_cannot_be_used_are_refused(octopi: Octopi, tmp_path: Path, 
 def test_unknown_words_are_refused(octopi: Octopi, files: list[Path]) -> None:
     with refused(r"hardnes: no property of this model; did you mean hardness\? it knows"):
         octopi.compare(files[0], files[1], "hardnes")
-    with refused("a unicorn: .*catalogue has no such object; .*NAME: soft"):
+    with refused("a unicorn: .*catalogue has no such object; .*a unicorn: soft"):
         octopi.match(files, ["rug", "millet", "a unicorn"])
     with refused(r"NAME: soft\|moderately hard\|hard, .*no bumps"):
         octopi.match(files[:2], {"a mug": ("hard", "smooth", "bumpy"), "a rug": ("soft", "rough", "no bumps")})

@@ -63,6 +63,10 @@ def test_an_answer_has_openai_s_form(client: TestClient) -> None:
     response = client.post(CHAT, json=body(user(text("How soft is it?"), part(video(1)))))
     answer = ChatCompletion.model_validate(response.json())
     assert response.json()["notes"] == ["video 1: little touches the sensor"]
+    assert response.json()["heads"] == "soft (50%)"
+    (touch,) = response.json()["touches"]
+    assert touch["probabilities"]["hardness"] == {"soft": 0.5, "hard": 0.25}
+    assert (touch["levels"]["hardness"], touch["calibrated"]) == ("soft", True)
     assert (answer.id[:9], answer.model) == ("chatcmpl-", "octopi")
     assert abs(answer.created - began) < HUNG
     (choice,) = answer.choices
@@ -76,7 +80,9 @@ def test_a_stream_has_openai_s_chunks(client: TestClient) -> None:
     assert response.headers["content-type"].startswith("text/event-stream")
     *events_, done = events(response.text)
     assert done == "[DONE]"
-    assert [event.get("notes") for event in events_] == [None] * 6 + [["video 1: little touches the sensor"]]
+    apart = ["video 1: little touches the sensor", "the sentence and the heads disagree"]
+    assert [event.get("notes") for event in events_] == [None] * 6 + [apart]
+    assert [event.get("heads") for event in events_] == [None] * 6 + ["soft (50%)"]
     chunks = [ChatCompletionChunk.model_validate(event) for event in events_]
     assert len({(c.id, c.created, c.model) for c in chunks}) == 1
     deltas = [c.choices[0].delta.model_dump(exclude_unset=True) for c in chunks]

@@ -40,7 +40,8 @@ function strip(title, pictures, captions) {
 
 function bars(touch) {
   const grid = make("div", "bars");
-  grid.append(make("p", "note", "Probabilities of each property alone; bold: the classes that go best together"));
+  grid.append(make("p", "note", `${touch.calibrated ? "Probabilities" :
+    "Scores, not calibrated on real videos,"} of each property alone; bold: the classes that go best together`));
   for (const [property, classes] of Object.entries(touch.probabilities)) {
     grid.append(make("h3", "", property));
     for (const [level, share] of Object.entries(classes)) {
@@ -48,7 +49,7 @@ function bars(touch) {
       filled.style.width = `${100 * share}%`;
       bar.append(filled);
       grid.append(make("span", touch.levels[property] === level ? "chosen" : "", level), bar,
-        make("span", "number", `${Math.round(100 * share)} %`));
+        make("span", "number", touch.calibrated ? `${Math.round(100 * share)} %` : share.toFixed(2)));
     }
   }
   return grid;
@@ -126,9 +127,12 @@ async function ask(event) {
     let answer = "";
     const reader = response.body.pipeThrough(new TextDecoderStream()).getReader();
     for (let piece = await reader.read(); !piece.done; piece = await reader.read()) {
-      said.textContent = answer += piece.value;
+      answer += piece.value;
+      said.textContent = answer.split("\x1e")[0];
     }
-    turns.push({question, touches: about, answer});
+    const [spoken, heads] = answer.split("\x1e");
+    if (heads) said.after(make("p", "note heads", heads));
+    turns.push({question, touches: about, answer: spoken});
     fresh = fresh.filter(id => !about.includes(id));
     $("question").value = "";
   } catch (error) {
