@@ -34,7 +34,7 @@ if __name__ == "__main__":
             graded += answers_about(octopi, params, videos, parts)
             for count, (seed, split) in product(params.evaluate.rated, splits.items()):
                 # A killed stage goes on behind what is answered; the key is all that this depends on, code included.
-                told = (octopi.config.digest, params.questions, params.data, params.split, octopi.llm.dtype)
+                told = (octopi.config.digest, params.questions, params.data, params.split, params.language.dtype)
                 key = fingerprint(*map(str, (*told, count, seed)), VIDEOS, split_file(seed), *code_of("evaluate"))
                 if not (done := CHECKPOINTS / "evaluate" / key / EVALUATED.name).is_file():
                     said = answers_after_ratings(octopi, params, videos, split, seed, count)
