@@ -94,7 +94,8 @@ class Sensor:
 
     def _see(self, seen: Seen) -> None:
         """Take in one picture, and say what is no press."""
-        over = seen.strength > RELEASED * seen.threshold
+        # The first pictures, on which the quiet level is measured, are compared with nothing.
+        over = len(self.quiet) >= LONGEST and seen.strength > RELEASED * seen.threshold
         if seen.state == "untouched":
             near, self.near, self.held, self.strongest = self.near, self.near + 1 if over else 0, 0, None
             if near >= SHORTEST and not over:
@@ -129,7 +130,7 @@ class Sensor:
         stamps, quiet, found = [*self.stamps], [*self.quiet][-LONGEST:], dict[str, bool]()
         if len(stamps) > LONGEST:
             span, count = stamps[-1] - stamps[0], len(stamps) - 1
-            rate, missing = 1e9 * count / span, round(span / float(np.median(np.diff(stamps)))) - count
+            rate, missing = 1e9 * count / max(1, span), round(span / max(1, np.median(np.diff(stamps)))) - count
             other = max(rate / (self.promised or rate), self.promised / rate) > SAME_RATE
             found[f"it says {self.promised:g} pictures a second, and gives {rate:.1f}"] = other
             found[f"it dropped {missing} of the last {count + missing} pictures"] = missing > LOST
@@ -150,7 +151,7 @@ class Sensor:
         told = {
             "camera": self.camera,
             "gone": self.gone or (f"{self.camera}: no picture for {late:.0f} s" if late > AGAIN else ""),
-            "rate": 1e9 * (len(stamps) - 1) / (stamps[-1] - stamps[0]) if len(stamps) > 1 else 0.0,
+            "rate": 1e9 * (len(stamps) - 1) / max(1, stamps[-1] - stamps[0]) if stamps else 0.0,
             "notes": self.notes(),
             "curve": [*self.curve],
         }
@@ -237,7 +238,8 @@ class Studio(Session):
 
     def live(self) -> dict[str, Any]:
         """The sensor as it is now, and what happened."""
-        return self.sensor.shown() | {"events": self.events[-RECENT:], "target": self.target, "busy": self.busy}
+        told = {"events": self.events[-12:], "said": len(self.events), "target": self.target, "busy": self.busy}
+        return self.sensor.shown() | told
 
     # ---- rate ----
 
@@ -277,11 +279,11 @@ class Studio(Session):
 
     # ---- adapt and ask ----
 
-    async def adapt(self) -> None:
+    async def adapt(self) -> str:
         """Adapt the model to all rated videos, as a new copy beside the older ones, and ask that from now on."""
-        await self.work(self._adapt)
+        return str(await self.work(self._adapt))
 
-    def _adapt(self) -> None:
+    def _adapt(self) -> str:
         try:
             catalogue = load_catalogue(self.data.catalogue)
             found, model = rated_videos([self.data.videos], catalogue), self.load(None)
@@ -292,6 +294,7 @@ class Studio(Session):
             to = self.copies / time.strftime("%Y%m%d-%H%M%S")
             self.told = adapt(model, [*found], to, catalogue=catalogue, objects=[*found.values()])
             self.model = self.load(str(to))
+            return self.told
         finally:
             self.busy = ""
 
