@@ -97,9 +97,10 @@ class Sensor:
         # The first pictures, on which the quiet level is measured, are compared with nothing.
         over = len(self.quiet) >= LONGEST and seen.strength > RELEASED * seen.threshold
         if seen.state == "untouched":
-            near, self.near, self.held, self.strongest = self.near, self.near + 1 if over else 0, 0, None
-            if near >= SHORTEST and not over:
+            if self.near >= SHORTEST and not over:
                 self.tell("too weak, nothing is recorded: press harder", [])
+                self.near = -2 * LONGEST  # The reference holds this touch until then, and shows its negative.
+            self.near, self.held, self.strongest = self.near + 1 if over or self.near < 0 else 0, 0, None
             self.quiet.append(seen)
         else:
             self.near, self.held = 0, self.held + over

@@ -262,13 +262,13 @@ async function compare() {
   if (!found) return;
   const table = make("table");
   table.append(...found.map(one => {
-    const line = make("tr"), [x, y] = one.expected, sign = Math.abs(x - y) < 0.1 ? "about as" : x > y ? "more than" : "less than";
-    const heads = `${a.name} ${x.toFixed(1)}, ${b.name} ${y.toFixed(1)}: ${sign}`;
-    line.append(make("th", "", spoken(one.property)), make("td", "", heads), make("td", "", one.answer));
+    const line = make("tr"), values = one.expected.map(value => value.toFixed(1)).join(" and ");
+    line.append(make("th", "", spoken(one.property)), make("td", "", values),
+      make("td", "", one.answer.split("Conclusion:").at(-1)));
     return line;
   }));
   $("compared").replaceChildren(make("h2", "", `${a.name} and ${b.name}`),
-    make("p", "note", "Expected class by the property heads, and the model's own answer"), table);
+    make("p", "note", "Expected classes by the property heads, and what the language model concludes"), table);
 }
 
 function open(name) {
