@@ -167,12 +167,14 @@ PHYSICLEAR = Path(__file__).parents[1] / "physiclear"
 @data_app.command()
 def check(
     folder: Annotated[Path, typer.Argument(help="Folder with the videos.")],
-    catalogue: Catalogue = PHYSICLEAR,
+    catalogue: Annotated[Path | None, typer.Option(help="By default FOLDER/catalogue, or else PhysiCLeAR's.")] = None,
 ) -> None:
     """List every file of a folder that is wrong or odd; status 1 where something must be mended."""
     from pipeline.videos.audit.run import check_folder
     from pipeline.videos.catalogue import load_catalogue
 
+    own = folder / "catalogue"
+    catalogue = catalogue or (own if own.is_dir() else PHYSICLEAR)
     _print_findings(check_folder(folder, load_catalogue(catalogue)))
 
 
@@ -610,6 +612,22 @@ def demo(
     from pipeline.use.demo import serve_demo
 
     serve_demo(lambda: _load(folder, base, device), catalogue, port)
+
+
+@app.command()
+def studio(
+    folder: Annotated[Path, typer.Argument(help="Folder of videos and ratings; made where it is not there.")],
+    camera: Annotated[str, typer.Option(help="A camera's index (0 is the first) or address, or a video.")] = "0",
+    times: Times = 2.0,
+    model: Model = None,
+    base: Base = None,
+    device: Device = "auto",
+    port: Annotated[int, typer.Option(help="Of 127.0.0.1.")] = 7860,
+) -> None:
+    """Show a page for a sensor on the desk: record presses, rate them, adapt the model, ask it. Nothing leaves."""
+    from pipeline.use.studio import serve_studio
+
+    serve_studio(lambda copy: _load(copy or model, base, device), folder, camera, times, port)
 
 
 def _print_notes(notes: Sequence[str], heads: str = "") -> None:

@@ -17,7 +17,7 @@ from uuid import uuid4
 
 import cv2
 import numpy as np
-from fastapi import FastAPI, Request
+from fastapi import APIRouter, Depends, FastAPI, Request
 from fastapi.responses import JSONResponse, Response, StreamingResponse
 from fastapi.staticfiles import StaticFiles
 from pydantic import BaseModel, Field
@@ -31,7 +31,7 @@ from pipeline.scenes.recipe import SceneRecipe, load_recipes
 from pipeline.scenes.render import make_scene, render
 from pipeline.tasks.opd import TEMPLATES
 from pipeline.use.results import Exchange, Pictures, Touch
-from pipeline.use.server import Failed, Worker, listen, make_server
+from pipeline.use.server import Failed, Worker, check_token, listen, make_server
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.film import write_film
 
@@ -168,21 +168,28 @@ def where(touch: Touch) -> Pictures:
     return painted
 
 
-def uri(picture: Pictures) -> str:
-    """A picture (height x width x RGB) as a PNG in a data URI."""
-    _, png = cv2.imencode(".png", picture[:, :, ::-1])
-    return f"data:image/png;base64,{base64.b64encode(png.tobytes()).decode()}"
+def uri(picture: Pictures, kind: str = "png") -> str:
+    """A picture (height x width x RGB) as a PNG or JPEG in a data URI."""
+    _, data = cv2.imencode(f".{kind}", picture[:, :, ::-1])
+    return f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode()}"
 
 
-def make_app(session: Session) -> FastAPI:
-    """The page and what it asks for. Errors of the user come back as one line, with status 422."""
+def make_app(session: Session, more: APIRouter | None = None, token: str = "") -> FastAPI:
+    """The page and what it asks for, and `more`; with a token only for who sends it.
+
+    Errors of the user come back as one line, with status 422.
+    """
 
     @asynccontextmanager
     async def life(_: FastAPI) -> AsyncIterator[None]:
         yield
         session.close()
 
-    app = FastAPI(lifespan=life, openapi_url=None)  # Its documentation page would load scripts from elsewhere.
+    async def guard(request: Request) -> None:
+        check_token(request, token)
+
+    # Its documentation page would load scripts from elsewhere.
+    app = FastAPI(lifespan=life, openapi_url=None, dependencies=[Depends(guard)])
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=HOSTS)
 
     @app.exception_handler(UserError)
@@ -224,6 +231,7 @@ def make_app(session: Session) -> FastAPI:
     async def ask(asked: Asked) -> StreamingResponse:
         return StreamingResponse(await session.stream(asked), media_type="text/plain; charset=utf-8")
 
+    app.include_router(more or APIRouter())
     app.mount("/", StaticFiles(directory=PAGE, html=True))
     return app
 

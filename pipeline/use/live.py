@@ -6,7 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from pipeline.running.errors import UserError
 from pipeline.use.model import with_marks
 from pipeline.videos.audit.files import FOUND
+from pipeline.videos.decoding import Image
 from pipeline.videos.frames.reference import LONGEST, contact_strength, mean, starts_touching
 from pipeline.videos.importing.presses import SHORTEST, Contact, Shot, begins_at, film
 
@@ -29,8 +30,27 @@ GONE = 100
 PAUSE = 0.02
 
 
-def watch(camera: str) -> Iterator[Shot]:
+class Seen(NamedTuple):
+    """One picture as the detector takes it."""
+
+    shot: Shot
+    thumb: Image
+    strength: float
+    """Contact strength, in 8-bit steps."""
+    threshold: float
+    """The strength that a press begins at."""
+    state: Literal["untouched", "pressed", "press", "short", "light"]
+    """`pressed` within a press. What ends with this picture is a `press`, too `short` for one, or a change of the
+    `light`; only a press is yielded."""
+
+
+def watch(camera: str, opened: Callable[[float], object] = lambda _: None) -> Iterator[Shot]:
     """The pictures of a file, or of a camera by its index or address, as they come.
+
+    A camera's are `recorded` in ns since 1970, and `stamped` by a clock that nobody sets.
+
+    Args:
+        opened: Is given the rate that a camera says it has, in pictures a second; 0 where it says none.
 
     Raises:
         UserError: for a camera that OpenCV cannot open, or a file that is no video.
@@ -43,14 +63,15 @@ def watch(camera: str) -> Iterator[Shot]:
     capture = cv2.VideoCapture(int(camera) if camera.isdecimal() else camera)
     if not capture.isOpened():
         raise UserError(f"{camera}: no camera that opens; name an index (0 is the first), a file or an address")
+    opened(capture.get(cv2.CAP_PROP_FPS))
     came, missed = False, 0
     try:
         while missed < GONE:  # A camera may drop a frame and deliver the next one.
             good, picture = capture.read()
-            now = time.monotonic_ns()
+            recorded, stamped = time.time_ns(), time.monotonic_ns()
             came, missed = came or good, 0 if good else missed + 1
             if good:
-                yield Shot(np.asarray(picture, dtype=np.uint8), now, now)
+                yield Shot(np.asarray(picture, dtype=np.uint8), recorded, stamped)
             else:
                 time.sleep(PAUSE)
     finally:
@@ -60,7 +81,9 @@ def watch(camera: str) -> Iterator[Shot]:
     raise UserError(f"{camera}: brings no picture any more; is it connected?")
 
 
-def presses(shots: Iterable[Shot], times: float = FOUND) -> Iterator[list[Shot]]:
+def presses(
+    shots: Iterable[Shot], times: float = FOUND, see: Callable[[Seen], object] = lambda _: None
+) -> Iterator[list[Shot]]:
     """Each press as soon as it ends, with up to `LONGEST` untouched pictures in front, which the model compares it to.
 
     A press begins where the contact strength is more than `times` the quiet level (the median of untouched pictures),
@@ -68,7 +91,7 @@ def presses(shots: Iterable[Shot], times: float = FOUND) -> Iterator[list[Shot]]
     reference is the mean of pictures a little older than the latest ones: it follows slow changes of the light, and
     does not yet contain a press that begins. A press that deepens over seconds is also taken for a change of the light,
     and its release then looks like a press. `starts_touching` recognises such a release by its loss of detail, and it
-    is dropped.
+    is dropped. `see` is given each picture whose strength is known.
 
     Raises:
         UserError: as `shots` raises it, after the press that had begun.
@@ -89,6 +112,7 @@ def presses(shots: Iterable[Shot], times: float = FOUND) -> Iterator[list[Shot]]
             if not press and (strength <= threshold or len(quiet) < LONGEST):
                 before.append((shot, thumb))
                 quiet.append(strength)
+                see(Seen(shot, thumb, strength, threshold, "untouched"))
                 continue
             if not press:
                 press = [old for old, _ in list(before)[-LONGEST:]]
@@ -97,13 +121,19 @@ def presses(shots: Iterable[Shot], times: float = FOUND) -> Iterator[list[Shot]]
             recent.append(thumb)
             over = contact.over(strength, threshold)
             released = contact.touched == LONGEST and starts_touching(first, mean(recent))
-            if over or len(press) == MOST or released:
-                if released or len(press) == MOST:
-                    before.clear()
-                    quiet.clear()
-                elif contact.touched >= SHORTEST:
-                    yield press
-                press, contact = [], Contact()
+            if not (over or len(press) == MOST or released):
+                see(Seen(shot, thumb, strength, threshold, "pressed"))
+                continue
+            if released or len(press) == MOST:
+                see(Seen(shot, thumb, strength, threshold, "light"))
+                before.clear()
+                quiet.clear()
+            elif contact.touched >= SHORTEST:
+                see(Seen(shot, thumb, strength, threshold, "press"))
+                yield press
+            else:
+                see(Seen(shot, thumb, strength, threshold, "short"))
+            press, contact = [], Contact()
     except UserError as error:  # A press that the camera's failure cut off is still yielded.
         gone = error
     if contact.touched >= SHORTEST:
@@ -127,7 +157,7 @@ def run(model: Octopi, camera: str, question: str, say: Callable[[str], object],
     number = 0
     for number, press in enumerate(presses(watch(camera), times), 1):
         video = np.stack([cv2.cvtColor(shot.picture, cv2.COLOR_BGR2RGB) for shot in press])
-        seconds = (press[-1].recorded - press[0].recorded) / 1e9
+        seconds = (press[-1].stamped - press[0].stamped) / 1e9
         rate = f"{(len(press) - 1) / seconds:.1f} a second" if seconds > 0 else "at once"
         try:
             if question:

@@ -7,7 +7,6 @@ taken, a new one is answered with status 429 before its body is read.
 from __future__ import annotations
 
 import asyncio
-import hmac
 import json
 import os
 import time
@@ -26,7 +25,7 @@ from pipeline.use.ask import classes_of
 from pipeline.use.media import PLACE, Gate
 from pipeline.use.protocol import Json, Reply, read_conversation, read_request
 from pipeline.use.results import Exchange
-from pipeline.use.server import Failed, Worker, listen, make_server
+from pipeline.use.server import Failed, Worker, check_token, listen, make_server
 
 if TYPE_CHECKING:
     from pipeline.use.model import Octopi
@@ -121,11 +120,8 @@ def make_app(model: Octopi, name: str, *, token: str = "", places: int = 32) -> 
         content, status = _error(error)
         return JSONResponse(content, status, getattr(error, "headers", None))
 
-    async def check_token(request: Request) -> None:
-        given = request.headers.get("authorization", "")
-        if token and not hmac.compare_digest(given.encode("utf-8", "replace"), f"Bearer {token}".encode()):
-            message = "wrong or no token; send Authorization: Bearer TOKEN"
-            raise HTTPException(401, message, {"WWW-Authenticate": "Bearer"})
+    async def check_caller(request: Request) -> None:
+        check_token(request, token)
         # A site may point its own name here, so that a visitor's browser asks for it (DNS rebinding).
         if not token and request.url.hostname not in LOCAL_NAMES:
             raise HTTPException(403, "this server has no token and answers to 127.0.0.1 and localhost only")
@@ -149,7 +145,7 @@ def make_app(model: Octopi, name: str, *, token: str = "", places: int = 32) -> 
     app = FastAPI(lifespan=lifespan, openapi_url=None)
     for kind in (HTTPException, UserError, Failed, ClientDisconnect, Exception):
         app.add_exception_handler(kind, refuse)
-    guarded, place = [Depends(check_token)], Depends(take_place)
+    guarded, place = [Depends(check_caller)], Depends(take_place)
 
     @app.post("/v1/chat/completions", dependencies=guarded)
     async def chat(request: Request, stack: ExitStack = place) -> Response:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import hmac
 import ipaddress
 import logging
 import queue
@@ -13,7 +14,8 @@ from contextlib import suppress
 from typing import Any
 
 import uvicorn
-from fastapi import FastAPI
+from fastapi import FastAPI, Request
+from starlette.exceptions import HTTPException
 
 from pipeline.running.errors import UserError
 
@@ -124,6 +126,14 @@ class Worker:
         except Exception as error:
             for job, _ in batch:
                 job.put(error)
+
+
+def check_token(request: Request, token: str) -> None:
+    """Refuse with status 401 who does not send the token, where there is one."""
+    given = request.headers.get("authorization", "")
+    if token and not hmac.compare_digest(given.encode("utf-8", "replace"), f"Bearer {token}".encode()):
+        message = "wrong or no token; send Authorization: Bearer TOKEN"
+        raise HTTPException(401, message, {"WWW-Authenticate": "Bearer"})
 
 
 def make_server(app: FastAPI) -> uvicorn.Server:

@@ -6,6 +6,11 @@ let touches = [];  // shown on the page
 let fresh = [];    // ids of those that no question was about yet
 let turns = [];    // of the conversation: {question, touches, answer}
 
+// The studio's address ends with a token; the demo has none.
+function call(address, options = {}) {
+  return fetch(address, {...options, headers: {...options.headers, Authorization: `Bearer ${location.hash.slice(1)}`}});
+}
+
 // Text is only ever set as text: a file's name or an answer never becomes markup.
 function make(tag, name, text) {
   const element = document.createElement(tag);
@@ -21,7 +26,7 @@ function tell(text, busy = false) {
 
 async function failed(response) {
   const body = await response.json().catch(() => ({}));
-  return body.error || `The server answered with status ${response.status}; see its terminal.`;
+  return body.error || body.detail || `The server answered with status ${response.status}; see its terminal.`;
 }
 
 function strip(title, pictures, captions) {
@@ -65,7 +70,8 @@ function draw() {
     });
     head.append(make("h2", "", `${place + 1}. ${touch.name}`), remove);
     const names = ["untouched", ...touch.numbers.map(n => `frame ${n}`)];
-    box.append(head, ...touch.notes.map(note => make("p", "note", note)),
+    box.append(head, ...(touch.sentence ? [make("p", "sentence", touch.sentence)] : []),
+      ...touch.notes.map(note => make("p", "note", note)),
       ...strip("What the model is given, behind the untouched sensor", [touch.reference, ...touch.frames],
         names),
       ...strip("Difference to the untouched sensor (grey: none)", [null, ...touch.difference], names),
@@ -80,7 +86,7 @@ async function show(address, body, name) {
   if (touches.length >= MOST) return tell(`No more than ${MOST} touches at a time; remove one.`);
   tell(`Feeling ${name} ...`, true);
   try {
-    const response = await fetch(address, {method: "PUT", body});
+    const response = await call(address, {method: "PUT", body});
     if (!response.ok) return tell(await failed(response));
     const touch = await response.json();
     touches.push(touch);
@@ -119,7 +125,7 @@ async function ask(event) {
   tell("");
   const asked = say("person", question), said = say("model", "...");
   try {
-    const response = await fetch("api/ask", {
+    const response = await call("api/ask", {
       method: "POST", headers: {"Content-Type": "application/json"},
       body: JSON.stringify({question, touches: about, history: turns}),
     });
@@ -144,10 +150,10 @@ async function ask(event) {
 }
 
 async function begin() {
-  const about = await (await fetch("api/about")).json();
-  $("model").textContent = about.model;
+  const about = await (await call("api/about")).json();
+  $("model").textContent ||= about.model;
   $("question").placeholder = about.example;
-  tell("Begin with a video of yours, or pick a synthetic scene; then press Ask.", true);
+  if (about.scenes.length) tell("Begin with a video of yours, or pick a synthetic scene; then press Ask.", true);
   for (const [id, name] of about.scenes) $("scene").append(new Option(name, id));
 }
 

@@ -1,0 +1,174 @@
+"""A folder of videos, objects and ratings in the layout of docs/data.md, as `octopi studio` fills it.
+
+What lies on disk is the truth: it is read anew at every call, and each change is one file that takes another's place.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+import shutil
+import time
+import unicodedata
+from collections.abc import Iterable, Sequence
+from itertools import zip_longest
+from pathlib import Path
+
+import yaml
+from pydantic import ValidationError
+
+from pipeline.core.io import atomic, remove_rests, write_csv, write_text
+from pipeline.running.errors import UserError, first_problem
+from pipeline.videos.audit.labels import icc3k
+from pipeline.videos.catalogue import OBJECTS, PROPERTIES
+from pipeline.videos.catalogue.csv_reader import Row, read_rows
+from pipeline.videos.catalogue.wording import Language
+from pipeline.videos.files import LIST_FILE, video_files
+from pipeline.videos.importing.presses import Recorded, first_free
+
+RATINGS = "ratings.csv"
+ASIDE = ".deleted"
+"""Where deleted videos wait for an undo, until the folder is opened again."""
+
+
+class RatedFolder:
+    """Videos in `videos/`; in `catalogue/` the properties, who rated which object how, and objects.csv made of that."""
+
+    def __init__(self, folder: Path, properties: Path) -> None:
+        """Open a folder, or make one with the properties of the file `properties`; UserError for a broken one."""
+        self.videos, self.catalogue, self.sessions = folder / "videos", folder / "catalogue", dict[str, str]()
+        self.videos.mkdir(parents=True, exist_ok=True)
+        file = self.catalogue / PROPERTIES
+        if not file.exists():  # `dataset` would put PhysiCLeAR's figures beside other videos'.
+            write_text(file, re.sub(r"(?m)^dataset:.*\n", "", properties.read_text(encoding="utf-8")))
+        try:
+            self.properties = Language.model_validate(yaml.safe_load(file.read_text(encoding="utf-8"))).properties
+        except (ValidationError, UnicodeDecodeError, yaml.YAMLError) as error:
+            what = first_problem(error) if isinstance(error, ValidationError) else str(error)
+            raise UserError(f"{file}: {' '.join(what.split())[:300]}") from None
+        self.names = [p.name for p in self.properties]
+        remove_rests(folder)
+        shutil.rmtree(self.videos / ASIDE, ignore_errors=True)
+        self.save(self.ratings())
+        self.list_videos()
+
+    # ---- ratings ----
+
+    def ratings(self) -> list[Row]:
+        """The lines of ratings.csv; behind them objects that objects.csv alone has, whose raters are numbered."""
+        rows = self._read(RATINGS, ["object_id", "rater", *self.names])
+        known = {row["object_id"] for row in rows}
+        for row in self._read(OBJECTS, ["object_id", "name", *self.names]):
+            if row["object_id"] not in known:
+                for n, each in enumerate(zip_longest(*(row[p].split() for p in self.names), fillvalue=""), 1):
+                    given = dict(zip(self.names, each, strict=True))
+                    rows.append({"object_id": row["object_id"], "rater": f"rater {n}"} | given)
+        return rows
+
+    def id_of(self, name: str) -> str:
+        """The id of an object, by which its videos are called: a new one's is its name, with _ for blanks and signs."""
+        known = {row["name"].lower(): row["object_id"] for row in self._read(OBJECTS, ["object_id", "name"])}
+        plain = unicodedata.normalize("NFC", name).strip().lower()
+        if key := known.get(plain) or re.sub(r"[^\w-]+", "_", plain).strip("_-"):
+            return key
+        raise UserError(f"{name!r}: no name for an object; write one with its article, such as: a block of foam")
+
+    def save(self, rows: Sequence[Row]) -> None:
+        """Write ratings.csv, and objects.csv with each object that has a class of every property from somebody.
+
+        Names and other columns of objects.csv stay as they are; a new object is called by its id.
+        """
+        self._write(RATINGS, ["object_id", "rater", *self.names], rows)
+        old, lines = {row["object_id"]: row for row in self._read(OBJECTS, ["object_id", "name"])}, list[Row]()
+        for key in dict.fromkeys(row["object_id"] for row in rows):
+            own = [row for row in rows if row["object_id"] == key]
+            cells = {p: " ".join(row[p] for row in own if row.get(p)) for p in self.names}
+            if all(cells.values()):
+                lines.append({"object_id": key, "name": key.replace("_", " ")} | old.get(key, {}) | cells)
+        columns = dict.fromkeys(["object_id", "name", *self.names, *(c for line in old.values() for c in line)])
+        self._write(OBJECTS, columns, lines)
+
+    def rate(self, rater: str, object_id: str, property: str, level: int) -> None:
+        """Write down one class that a rater gives an object."""
+        if not rater or level not in {p.name: range(len(p.levels)) for p in self.properties}.get(property, ()):
+            raise UserError(f"{rater!r}, {property}, {level}: no such rater, property or class; load the page anew")
+        rows = self.ratings()
+        row = next((row for row in rows if (row["object_id"], row["rater"]) == (object_id, rater)), Row())
+        if not row:
+            rows.append(row)
+        row |= {"object_id": object_id, "rater": rater, property: str(level)}
+        self.save(rows)
+
+    def rename(self, old: str, new: str, name: str) -> str:
+        """Give an object another id and name, with its videos and ratings; the name that it had."""
+        rows, videos, lines = self.ratings(), self.recorded(), self._read(OBJECTS, ["object_id", "name"])
+        if new in {row["object_id"] for row in rows} | {video.object_id for video in videos}:
+            raise UserError(f"{new}: is another object; give the videos to it one by one")
+        for video in videos:
+            if video.object_id == old:
+                self.move(video.file, new)
+        names = {line["object_id"]: line["name"] for line in lines}
+        lines = [line | {"object_id": new, "name": name} if line["object_id"] == old else line for line in lines]
+        if lines:
+            self._write(OBJECTS, lines[0], lines)
+        self.save([row | {"object_id": new} if row["object_id"] == old else row for row in rows])
+        return names.get(old, old.replace("_", " "))
+
+    def agreement(self) -> dict[str, tuple[float, float, float] | None]:
+        """By property ICC(3,k) with its interval, over the objects that every rater rated; None where undefined."""
+        by = {(row["object_id"], row["rater"]): row for row in self.ratings()}
+        objects, raters = (list(dict.fromkeys(key[place] for key in by)) for place in (0, 1))
+        found = {}
+        for p in self.names:
+            table = [[by.get((key, rater), {}).get(p) for rater in raters] for key in objects]
+            found[p] = icc3k([[int(level) for level in row if level] for row in table if all(row)])
+        return found
+
+    def _read(self, name: str, needed: Sequence[str]) -> list[Row]:
+        file = self.catalogue / name
+        return [row for _, row in read_rows(file, needed)[1]] if file.exists() else []
+
+    def _write(self, name: str, columns: Iterable[str], rows: Sequence[Row]) -> None:
+        with atomic(self.catalogue / name) as part, part.open("w", encoding="utf-8", newline="") as stream:
+            writer = csv.DictWriter(stream, list(columns), restval="", extrasaction="ignore", lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+
+    # ---- videos ----
+
+    def recorded(self) -> list[Recorded]:
+        """The videos that are there: as videos.csv lists them, then those that it lacks, by their names."""
+        there = {path.relative_to(self.videos).as_posix(): path for path in video_files(self.videos)[0]}
+        file, found = self.videos / LIST_FILE, dict[str, Recorded]()
+        for _, row in read_rows(file, ["file", "object_id"])[1] if file.exists() else ():
+            if row["file"] in there:
+                found[row["file"]] = Recorded(**{key: row.get(key, "") for key in Recorded.model_fields})
+        for name, path in there.items():
+            if name not in found and (match := re.fullmatch(r"([\w-]+)_\d+", path.stem)):
+                found[name] = Recorded(file=name, object_id=match[1], session=self.sessions.get(name, ""))
+        return list(found.values())
+
+    def list_videos(self) -> None:
+        """Write videos.csv; none for no video, since it would be an error of its own."""
+        if rows := self.recorded():
+            write_csv(self.videos / LIST_FILE, Recorded, rows)
+        else:
+            (self.videos / LIST_FILE).unlink(missing_ok=True)
+
+    def move(self, file: str, to: str) -> tuple[str, str]:
+        """Give a video to another object, or with an empty `to` put it aside; where it is now, and whose it was."""
+        row = next((row for row in self.recorded() if row.file == file), None)
+        if row is None and file not in self.sessions:
+            raise UserError(f"{file}: no such video; load the page anew")
+        source = self.videos / file
+        free = f"{to}_{first_free(self.videos, to)}{source.suffix}"
+        now = free if to else f"{ASIDE}/{time.time_ns()}_{source.name}"
+        self.sessions[now] = row.session if row else self.sessions[file]
+        target = self.videos / now
+        target.parent.mkdir(exist_ok=True)
+        for suffix in (".csv", source.suffix):  # The times first, so that no video is without them.
+            if source.with_suffix(suffix).is_file():
+                os.replace(source.with_suffix(suffix), target.with_suffix(suffix))
+        self.list_videos()
+        return now, row.object_id if row else ""

@@ -1,0 +1,114 @@
+"""The folder that the studio fills: read by the catalogue's own reader, and nothing is lost on the way."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+import pingouin
+import pytest
+
+from pipeline.config.params import compose
+from pipeline.core.io import read_csv
+from pipeline.scales import check_inputs
+from pipeline.use.rated_folder import RatedFolder
+from pipeline.videos.audit.run import check_folder
+from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.importing.presses import Recorded
+from tests.conftest import ROOT, refused
+from tests.use.videos import press
+
+PROPERTIES = ROOT / "pipeline" / "physiclear" / "properties.yaml"
+LEVELS = {"hardness": 0, "roughness": 2, "bumpiness": 1}
+
+
+def opened(folder: Path, *videos: str) -> RatedFolder:
+    (folder / "videos").mkdir(parents=True, exist_ok=True)
+    for name in videos:
+        press(folder / "videos" / name)
+    return RatedFolder(folder, PROPERTIES)
+
+
+def rate(data: RatedFolder, rater: str, object_id: str, **levels: int) -> None:
+    for name, level in (LEVELS | levels).items():
+        data.rate(rater, object_id, name, level)
+
+
+def test_what_raters_say_is_a_catalogue_that_the_chain_trains_on(tmp_path: Path) -> None:
+    data = opened(tmp_path, *(f"object_{key}_{n}.mp4" for key in "abcdefgh" for n in range(2)))
+    for place, key in enumerate("abcdefgh"):
+        rate(data, "ann", f"object_{key}", hardness=place % 3)
+        data.rate("ben", f"object_{key}", "hardness", 2)
+    with refused("class"):
+        data.rate("ben", "object_a", "hardness", 3)
+    catalogue = load_catalogue(data.catalogue)
+    assert catalogue.objects["object_b"].ratings == ((1, 2), (2,), (1,)), "in the raters' order, what is there"
+    assert catalogue.language.dataset == "", "PhysiCLeAR's figures are not for these videos"
+    assert [f for f in check_folder(tmp_path, catalogue) if f.severity == "error"] == []
+    check_inputs(compose("finetune", [f"data.dir={data.videos}", f"data.catalogue={data.catalogue}"]))
+    rate(data, "ann", "object_a", hardness=1)
+    assert load_catalogue(data.catalogue).labels("object_a") == (2, 2, 1), "who changes her mind is asked once"
+
+
+def test_agreement_is_that_of_a_statistics_package(tmp_path: Path) -> None:
+    data, given = opened(tmp_path), {"ann": (0, 1, 2, 2), "ben": (0, 2, 1, 2), "cid": (1, 1, 2, 2)}
+    rows = [(rater, key, level) for rater, levels in given.items() for key, level in zip("abcd", levels, strict=True)]
+    for rater, key, level in rows:
+        rate(data, rater, key, hardness=level)
+    rate(data, "ann", "what_ann_alone_rated", hardness=2)
+    table = pd.DataFrame(rows, columns=["rater", "object", "level"])
+    found = pingouin.intraclass_corr(table, "object", "rater", "level").set_index("Type")["ICC"]
+    agreement = data.agreement()
+    assert agreement["hardness"] is not None
+    assert agreement["hardness"][0] == pytest.approx(found[found.index.intersection(["ICC3k", "ICC(C,k)"])[0]])
+    assert agreement["roughness"] is None, "where nothing differs, there is none"
+
+
+def test_a_folder_written_by_hand_stays_as_it_is(tmp_path: Path) -> None:
+    """Names and splits stay; nobody knows whose its ratings are, so raters are numbered."""
+    (catalogue := tmp_path / "catalogue").mkdir()
+    (catalogue / "properties.yaml").write_bytes((ROOT / "examples/new_sensor/properties.yaml").read_bytes())
+    lines = ["object_id,name,hardness,roughness,bumpiness,split_lab", "foam,a block of foam,0 1,1 1,0 0,train"]
+    (catalogue / "objects.csv").write_text("\n".join([*lines, "glass,a pane of glass,2,0,0,test\n"]))
+    before = load_catalogue(catalogue)
+    data = opened(tmp_path, "glass_0.mp4")
+    assert load_catalogue(catalogue) == before
+    assert [row["rater"] for row in data.ratings()] == ["rater 1", "rater 2", "rater 1"]
+    assert data.id_of("A block of foam") == "foam"
+    rate(data, "ann", "glass")
+    assert data.rename("glass", "pane", "a big pane, of glass") == "a pane of glass"
+    found = load_catalogue(catalogue).objects["pane"]
+    assert (found.name, found.ratings[0]) == ("a big pane, of glass", (2, 0))
+    assert found.splits == before.objects["glass"].splits
+    assert [video.file for video in data.recorded()] == ["pane_0.mp4"]
+    with refused("is another object"):
+        data.rename("foam", "pane", "a pane")
+    (catalogue / "properties.yaml").write_text("properties: [\n")
+    with refused("properties.yaml: "):
+        RatedFolder(tmp_path, PROPERTIES)
+
+
+def test_videos_move_come_back_and_survive_a_kill(tmp_path: Path) -> None:
+    data = opened(tmp_path, "foam_0.mp4", "foam_1.mp4")
+    rows = [Recorded(file=f"foam_{n}.mp4", object_id="foam", session="monday") for n in range(2)]
+    listed = data.videos / "videos.csv"
+    listed.write_text("file,object_id,session\nfoam_0.mp4,foam,monday\nfoam_1.mp4,foam,monday\n")
+    (data.videos / "foam_1.csv").write_text("frame\n0\n")
+    content = (data.videos / "foam_1.mp4").read_bytes()
+    now, whose = data.move("foam_1.mp4", "")
+    assert [row.file for row in data.recorded()] == ["foam_0.mp4"]
+    assert data.move(now, whose) == ("foam_1.mp4", "")
+    assert read_csv(listed, Recorded) == rows, "an undo brings the session back, too"
+    assert (data.videos / "foam_1.mp4").read_bytes() == content
+    assert (data.videos / "foam_1.csv").exists()
+    data.move("foam_0.mp4", "a_sponge")
+    assert {(row.file, row.session) for row in read_csv(listed, Recorded)} >= {("a_sponge_0.mp4", "monday")}
+    with refused("no such video"):
+        data.move("../catalogue/properties.yaml", "foam")
+    # Killed between a video and its line, or between a deletion and its line; a part is of a process that ended.
+    press(data.videos / "foam_7.mp4")
+    (data.videos / "a_sponge_0.mp4").unlink()
+    (rest := data.videos / ".foam_8.999999999.part.mp4").write_bytes(content)
+    assert [row.file for row in opened(tmp_path).recorded()] == ["foam_1.mp4", "foam_7.mp4"]
+    assert [row.file for row in read_csv(listed, Recorded)] == ["foam_1.mp4", "foam_7.mp4"]
+    assert not rest.exists()

@@ -1,0 +1,143 @@
+"""The studio: a camera that is odd in every way, and the whole page in a real browser, killed in the middle."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import httpx2
+import numpy as np
+import pytest
+
+from pipeline.use import live, studio
+from pipeline.use.studio import Sensor
+from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.film import write_film
+from pipeline.videos.importing.presses import Shot
+from tests.closure import ROOT
+from tests.conftest import HUNG
+from tests.models import model_folder
+from tests.use.browser import Tab, tab
+from tests.use.test_live import Camera
+from tests.use.videos import recording
+
+CLASSES = {"foam": (0, 1, 0), "brick": (2, 2, 0), "toy_brick": (2, 0, 2)}
+
+
+def until(true: Callable[[], object]) -> None:
+    end = time.monotonic() + HUNG
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def test_what_is_odd_about_camera_gel_and_press_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A camera that says 60 and gives fewer, whose light changes, and that is unplugged in a press, then comes back."""
+    pictures: list[np.ndarray] = recording([range(30, 50), range(80, 82), range(100, 140)], 120)
+    weak = [np.rint(0.8 * a + 0.2 * b).astype(np.uint8) for a, b in zip(pictures[:6], pictures[32:38], strict=True)]
+    told, opened = list[tuple[str, list[Shot]]](), list[Any]()
+
+    class Slow(Camera):
+        def read(self) -> tuple[bool, Any]:
+            time.sleep(0.01)
+            return super().read()
+
+    def plugged(name: object) -> Camera:
+        light = [np.clip(picture.astype(int) + 20, 0, 255).astype(np.uint8) for picture in pictures[:25]]
+        opened.append(Slow([*pictures[:80], *weak, *pictures[:15], *pictures[80:]] if not opened else light, name))
+        return opened[-1]
+
+    monkeypatch.setattr(cv2, "VideoCapture", plugged)
+    monkeypatch.setattr(live, "PAUSE", 0.0)
+    monkeypatch.setattr(studio, "AGAIN", 0.1)
+    sensor = Sensor("0", 2.0, lambda odd, press: told.append((odd, press)))
+    until(lambda: any("says 60" in note for note in sensor.notes()))
+    until(lambda: len(opened) > 1)
+    until(lambda: any("changed by +" in note for note in sensor.notes()))
+    sensor.close()
+    found = [(odd.partition(":")[0].partition(",")[0], bool(press)) for odd, press in told]
+    assert found == [("", True), ("too weak", False), ("too short", False), ("cut off before the release", True)]
+    assert len({shot.stamped for shot in told[0][1]}) == len(told[0][1]), "each picture has its time"
+
+
+class Running:
+    """`octopi studio` as a user starts it."""
+
+    def __init__(self, folder: Path, camera: Path) -> None:
+        options = ["--camera", camera, "--base", model_folder("smollm2"), "--device", "cpu"]
+        command = [Path(sys.executable).with_name("octopi"), "studio", folder, *options, "--port", "0"]
+        self.process = subprocess.Popen([*map(str, command)], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        assert self.process.stdout is not None
+        self.address = self.process.stdout.readline().split()[0]
+
+    def end(self) -> None:
+        self.process.kill()
+        self.process.wait(HUNG)
+
+
+def submit(page: Tab, field: str, text: str) -> None:
+    page.run(f"(f => {{ f.value = {text!r}; f.dispatchEvent(new Event('change')); f.form.requestSubmit() }})({field})")
+
+
+def rate(page: Tab, rater: str, classes: Sequence[int]) -> None:
+    submit(page, "document.querySelector('#rater')", rater)
+    page.until("document.querySelectorAll('.card').length === 3 && !document.querySelector('.card.done')")
+    for place, level in enumerate(classes):
+        slider = f"document.querySelectorAll('input[type=range]')[{place}]"
+        page.run(f"(s => {{ s.value = {level}; s.dispatchEvent(new Event('click')) }})({slider})")
+    page.until("document.querySelectorAll('.card.done').length === 3")
+
+
+def test_record_rate_adapt_and_ask_in_a_browser(tmp_path: Path) -> None:
+    write_film(camera := tmp_path / "camera.mp4", recording([range(40, 60)], 75, height=96, width=128), 25.0)
+    lab, (first, *others) = tmp_path / "lab", CLASSES
+    run = Running(lab, camera)
+    try:
+        with tab(tmp_path, 1440) as page:
+            page.call("Page.navigate", url=run.address)
+            page.until("document.querySelector('#gone').textContent.endsWith('has ended')")
+            submit(page, "document.querySelector('#object')", first)
+            submit(page, "document.querySelector('#camera')", str(camera))
+            page.until("document.querySelectorAll('.chip').length === 1")
+            submit(page, "document.querySelector('#camera')", str(camera))
+            page.until("document.querySelector('#curve.pressed')")
+            run.end()  # In the middle of a press: what was recorded before is there.
+            page.until("document.querySelector('#gone').textContent.includes('does not answer')")
+            run = Running(lab, camera)
+            page.call("Page.navigate", url=run.address)
+            page.until("document.querySelectorAll('.chip').length === 1")
+            for number, name in enumerate(others, 2):
+                submit(page, "document.querySelector('#object')", name)
+                submit(page, "document.querySelector('#camera')", str(camera))
+                page.until(f"document.querySelectorAll('.chip').length === {number}")
+            page.run("document.querySelector('[data-part=rate]').click()")
+            flat = [level for classes in CLASSES.values() for level in classes]
+            rate(page, "ann", flat)
+            rate(page, "ben", [1, *flat[1:]])
+            said = "document.querySelector('#summary').textContent"
+            page.until(f"{said}.includes('no smooth and no bumps object yet') && {said}.includes('ann, ben')")
+            page.run("document.querySelector('[data-part=adapt]').click()")
+            assert "foam again: raters disagree" in page.run("document.querySelector('#next').textContent")
+            page.run("document.querySelector('#fit').click()")
+            page.until("document.querySelector('#told').textContent.includes('3 rated objects (3 videos)')")
+            submit(page, "document.querySelector('#camera')", str(camera))
+            page.until("document.querySelector('.touch .sentence') && document.querySelectorAll('.bar').length === 9")
+            assert page.complaints() == []
+        ratings = {key: [*zip(c, c, strict=True)] for key, c in CLASSES.items()} | {"foam": [(0, 1), (1, 1), (0, 0)]}
+        found = load_catalogue(lab / "catalogue").objects
+        assert {key: [*o.ratings] for key, o in found.items()} == ratings
+        assert sorted(f.name for f in (lab / "videos").glob("*.mp4")) == [
+            *("brick_0.mp4", "foam_0.mp4", "toy_brick_0.mp4", "unknown_0.mp4")
+        ]
+        api = run.address.partition("studio.html")[0] + "api/"
+        token = {"Authorization": f"Bearer {run.address.partition('#')[2]}"}
+        asked = [httpx2.get(f"{api}state", headers=h).status_code for h in ({}, {**token, "Host": "evil.example"})]
+        assert asked == [401, 400], "no other site, nobody without the token"
+        assert len(httpx2.get(f"{api}state?rater=cid", headers=token).json()["ratings"]) == 0, "raters are blind"
+    finally:
+        run.end()
