@@ -41,6 +41,10 @@ questions_app = typer.Typer(help="Let any other model answer the run's questions
 app.add_typer(questions_app, name="questions")
 
 
+task_app = typer.Typer(help="Write a task of your own.", no_args_is_help=True)
+app.add_typer(task_app, name="task")
+
+
 @app.callback(invoke_without_command=True)
 def octopi(version: Annotated[bool, typer.Option("--version", help="Say the version, and no more.")] = False) -> None:
     """Teach a language model the sense of touch."""
@@ -198,6 +202,17 @@ def audit(
     write_csv(out, Finding, findings)
     typer.echo(f"{len(findings)} findings in {out}")
     _print_findings(findings)
+
+
+@task_app.command("check")
+def check_task(
+    name: Annotated[str, typer.Argument(help="Its name, such as pc.")], catalogue: Catalogue = PHYSICLEAR
+) -> None:
+    """Build questions of a task, and grade right and wrong answers to them; status 1 where one is not as it should."""
+    from pipeline.cli.task import check
+    from pipeline.videos.catalogue import load_catalogue
+
+    typer.echo(check(name, load_catalogue(catalogue).asking("published")))
 
 
 @import_app.command()

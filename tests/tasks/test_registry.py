@@ -2,31 +2,39 @@
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
 
+from pipeline.cli.task import check
 from pipeline.config import QuestionsConfig
 from pipeline.core.io import read_jsonl, write_jsonl
 from pipeline.core.records import Dialogue, Opd, Question, Turn
 from pipeline.evaluation.grading import grade
-from pipeline.tasks import TASKS, psr
-from pipeline.tasks.base import TaskDefinition
+from pipeline.tasks import TASKS, pc, psr
 from pipeline.tasks.pom import fact
 from pipeline.tasks.questions import CHOICES, build_questions, counts_by_task
 from tests.conftest import ROOT, refused
 from tests.tasks.shared import CATALOGUE, POOL, predicted
 
+READ = pc.read
+
 
 def test_a_registered_task_is_counted_built_stored_and_graded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    # The task that docs/tasks.md shows whole.
-    names: dict[str, TaskDefinition] = {}
-    exec((ROOT / "docs" / "tasks.md").read_text().split("```python\n")[1].split("```")[0], names)
-    monkeypatch.setitem(TASKS, "HARD", names["TASK"])
+    # The tasks that docs/tasks.md shows whole: about one video, and about two.
+    for name, text in zip(
+        ("hard", "same"), (ROOT / "docs" / "tasks.md").read_text().split("```python\n")[1:], strict=True
+    ):
+        module = ModuleType(f"pipeline.tasks.{name}")
+        exec(text.split("```")[0], vars(module))
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+        monkeypatch.setitem(TASKS, name.upper(), module.TASK)
     counts = counts_by_task(QuestionsConfig(train={}, evaluation={"hard": 6, "pc": 2}), "evaluation")
-    assert counts == {"OPD": 0, "PC": 2, "PSS": 0, "POM": 0, "PSR": 0, "RIPE": 0, "HARD": 6}
+    assert counts == {**dict.fromkeys(TASKS, 0), "PC": 2, "HARD": 6}
     built = build_questions(POOL, counts, seed=0, distinct=True, facts=True)
     write_jsonl(tmp_path / "q.jsonl", built)
     questions = [q for q in read_jsonl(tmp_path / "q.jsonl", Question) if q.task == "HARD"]
@@ -38,6 +46,24 @@ def test_a_registered_task_is_counted_built_stored_and_graded(monkeypatch: pytes
         classes = [[(level, float(level)) for level in CATALOGUE.labels(question.objects[0])]]
         concluded = TASKS["HARD"].conclude(question, classes, CATALOGUE)
         assert grade([question], [predicted(question, concluded)], CATALOGUE)[0].correct
+    for name in TASKS:
+        assert "questions; right answers" in check(name.lower(), CATALOGUE)
+
+
+def test_a_task_that_reads_too_much_or_too_little_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    with refused("pcc: no task; did you mean pc. name its module in MODULES"):
+        check("pcc", CATALOGUE)
+    for readings, words in (
+        ({"yes": "yes"}, "PC: a right answer is graded wrong"),
+        (dict.fromkeys(("yes", "no", "same"), "yes"), "PC: a right answer is graded wrong"),
+    ):
+        monkeypatch.setattr(pc, "read", lambda answer, known=readings, read=READ: known.get(read(answer)))
+        with refused(words):
+            check("pc", CATALOGUE)
+    # Any "yes" in an answer is read, also in one that says neither.
+    monkeypatch.setattr(pc, "read", lambda answer: READ(answer) or ("yes" if "yes" in answer.lower() else None))
+    with refused("PC: a wrong answer is graded right: 'yes or no'"):
+        check("pc", CATALOGUE)
 
 
 @pytest.mark.parametrize(
