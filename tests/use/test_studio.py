@@ -100,7 +100,7 @@ def test_record_rate_adapt_and_ask_in_a_browser(tmp_path: Path) -> None:
     try:
         with tab(tmp_path, 1440) as page:
             page.call("Page.navigate", url=run.address)
-            page.until("document.querySelector('#gone').textContent.endsWith('has ended')")
+            page.until("document.querySelector('#gone')?.textContent.endsWith('has ended')")
             submit(page, "document.querySelector('#object')", first)
             submit(page, "document.querySelector('#camera')", str(camera))
             page.until("document.querySelectorAll('.chip').length === 1")

@@ -237,7 +237,7 @@ function draw_sensor(live) {
   $("rate-of").textContent = live.rate ? `${live.rate.toFixed(1)} pictures a second` : "";
   $("notes").replaceChildren(...live.notes.map(note => make("li", "", note)));
   $("events").replaceChildren(...live.events.slice(-5).reverse().map(e => make("li", "", e.text)));
-  $("target").textContent = live.target ? `Press it now: each press is recorded as ${live.target}_\u2026.mp4`
+  $("target").textContent = live.target ? `Press it now: each press is recorded as ${live.target}_NUMBER.mp4`
     : "Nothing is recorded: name the object.";
   $("busy").textContent = live.busy;
   if (document.activeElement !== $("camera")) $("camera").value = live.camera;
