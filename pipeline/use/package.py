@@ -117,7 +117,10 @@ def package(params: Params, variant: Variant, base: Base, out: Path) -> None:
             objects=read_json(aligned / OBJECTS_FILE),
             scores={task: score[1:4] for task, score in scores.items()},
             files={f.relative_to(folder).as_posix(): sha256(f) for f in sorted(folder.rglob("*")) if f.is_file()},
-            versions={"python": platform.python_version(), **{name: metadata.version(name) for name in LIBRARIES}},
+            versions={
+                "python": ".".join(platform.python_version_tuple()[:2]),
+                **{name: metadata.version(name) for name in LIBRARIES},
+            },
         )
         write_json(folder / CONFIG, config.model_dump(mode="json"))
         known = read_json(layout.REPORTS / params.report_name / "provenance.json")["settings"]

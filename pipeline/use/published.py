@@ -154,7 +154,10 @@ def convert(
             objects=tuple(sorted(o.object_id for o in catalogue.objects.values() if o.splits["release"] in met)),
             scores={},
             files={f.relative_to(folder).as_posix(): sha256(f) for f in sorted(folder.rglob("*")) if f.is_file()},
-            versions={"python": platform.python_version(), **{name: metadata.version(name) for name in LIBRARIES}},
+            versions={
+                "python": ".".join(platform.python_version_tuple()[:2]),
+                **{name: metadata.version(name) for name in LIBRARIES},
+            },
         )
         write_json(folder / CONFIG, model.model_dump(mode="json"))
         write_card(
