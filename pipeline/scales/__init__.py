@@ -48,8 +48,8 @@ def check_inputs(params: Params) -> str:
         raise UserError(f"data.dir: {folder} is a file; name the folder that the videos are in")
     if params.data.source == "videos" and not folder.is_dir():
         raise UserError(
-            f"data.dir: {folder} does not exist; import the public data set (README, section Real videos) or name the "
-            "folder with data.dir=..."
+            f"data.dir: {folder} does not exist; import the public data set (README, Real videos, real weights) or "
+            "name the folder with data.dir=..."
         )
     unknown = [o for o in params.scenes.objects if o not in catalogue.objects]
     if unknown:

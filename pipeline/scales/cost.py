@@ -50,9 +50,9 @@ def costs(params: Params, shapes: Shapes) -> Iterator[str]:
             # Pickles are converted into a second folder, and may be removed then.
             fetched += size if llm is None else 2 * size
             gigabytes = f"{_round(size / GB)} GB{twice}"
-            yield f"Download: {found.repository}, {gigabytes}, to {folder} (README, section Real weights)."
+            yield f"Download: {found.repository}, {gigabytes}, to {folder} (README, Real videos, real weights)."
     if params.data.source == "videos" and not place.is_dir():
-        yield f"Videos: {params.data.dir} is not there (README, section Real videos)."
+        yield f"Videos: {params.data.dir} is not there (README, Real videos, real weights)."
     yield disk(params, shapes, objects, fetched)
     devices, sharded = launched(params.runtime.launcher)
     if shapes.llm is not None and sharded:
