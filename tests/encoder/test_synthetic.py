@@ -27,7 +27,7 @@ from pipeline.running.errors import UserError
 from pipeline.scenes.geometry import heights
 from pipeline.scenes.invent import MODULUS_MPA, invent
 from pipeline.scenes.measure import bump_share, texture
-from pipeline.scenes.recipe import RecipeName
+from pipeline.scenes.recipe import SceneRecipe
 from pipeline.videos.frames.subtraction import subtract
 from tests.frame_rules import pillow
 
@@ -218,7 +218,7 @@ def test_an_item_of_a_training_depends_on_seed_epoch_and_number_alone(drawn: Syn
 @settings(max_examples=40)
 def test_what_is_invented_can_be_made(seed: int) -> None:
     recipe = invent(np.random.default_rng(seed))
-    assert RecipeName.model_validate_json(recipe.model_dump_json()) == recipe
+    assert SceneRecipe.model_validate_json(recipe.model_dump_json()) == recipe
     assert recipe == invent(np.random.default_rng(seed))
     assert MODULUS_MPA[0] <= recipe.modulus <= MODULUS_MPA[1]
     kinds = [layer.kind for layer in recipe.relief]
