@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from shutil import which
+from subprocess import run
 
 from pipeline.config.params import CHAIN, load_params
 from pipeline.running.errors import UserError
@@ -67,11 +69,11 @@ def reproduce(root: Path, arguments: list[str]) -> int:
     if waiting or arguments:
         for handler in logging.getLogger("dvc").handlers:
             handler.addFilter(shown)
-        status = int(dvc(["repro", *arguments]))
+        ended = int(dvc(["repro", *arguments]))
         if stopped and isinstance(stopped[0], KeyboardInterrupt):
             raise KeyboardInterrupt
-        if status:
-            return 130 if stopped else status
+        if ended:
+            return 130 if stopped else ended
     else:
         print(f"{name}: all {total} stages are up to date")
     if not (arguments or params.tracking.uri or (MLRUNS / "mlflow.db").is_file()):
@@ -79,7 +81,10 @@ def reproduce(root: Path, arguments: list[str]) -> int:
         attempt(params.tracking, publish, params)
     print(f"Report: reports/{name}/README.md; all reports on one page: reports/index.html")
     print("Dashboard: make dashboard, then open the link to all variants that it prints after ten seconds")
-    if waiting:
-        kept = f"git add dvc.lock params.yaml reports && git commit -m '{name}'"
+    made = ["dvc.lock", "params.yaml", "reports"]
+    status = ["git", "status", "--porcelain", *made]
+    # A run that gave what is committed leaves nothing to keep; nor is there anything to say without Git.
+    if which("git") and run(status, cwd=root, capture_output=True, check=False).stdout:
+        kept = f"git add {' '.join(made)} && git commit -m '{name}'"
         print(f"Keep this run, which Git does not know yet: {kept} (docs/dashboard.md: how to go back)")
     return 0

@@ -9,7 +9,7 @@ import pingouin
 import pytest
 
 from pipeline.config.params import compose
-from pipeline.core.io import read_csv
+from pipeline.core.io import read_csv, read_json
 from pipeline.scales import check_inputs
 from pipeline.use.rated_folder import RatedFolder
 from pipeline.videos.audit.run import check_folder
@@ -32,6 +32,19 @@ def opened(folder: Path, *videos: str) -> RatedFolder:
 def rate(data: RatedFolder, rater: str, object_id: str, **levels: int) -> None:
     for name, level in (LEVELS | levels).items():
         data.rate(rater, object_id, name, level)
+
+
+def test_raters_are_told_what_the_document_says() -> None:
+    lines = (ROOT / "docs" / "data.md").read_text(encoding="utf-8").splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("| ")]
+    told = read_json(ROOT / "pipeline" / "use" / "page" / "raters.json")
+    for name, guide in told.items():
+        what, how, *classes = next(row[1:] for row in rows if row[0] == name and len(row) == 6)
+        assert [what, how] == [guide["what"], guide["how"]]
+        for cell, (level, means) in zip(classes, guide["levels"].items(), strict=True):
+            assert cell == (means if means.startswith(level) else f"{level}: {means}")
+    properties = load_catalogue(PROPERTIES.parent).properties
+    assert {p.name: list(p.levels) for p in properties} == {name: list(g["levels"]) for name, g in told.items()}
 
 
 def test_what_raters_say_is_a_catalogue_that_the_chain_trains_on(tmp_path: Path) -> None:
