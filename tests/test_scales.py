@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -17,7 +18,7 @@ from pipeline.core.records import Part
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.running.errors import UserError
 from pipeline.scales import compose
-from pipeline.scales.cost import costs, disk, embedded
+from pipeline.scales.cost import card, costs, disk, embedded
 from pipeline.scales.memory import GIB, Use, count, launched, read_shapes, trained_parameters
 from pipeline.videos.catalogue import Catalogue
 from pipeline.weights.check import parameters, read_language, read_tower
@@ -149,6 +150,14 @@ def test_the_papers_scales_fit_the_cards_they_name() -> None:
         said[scale] = "\n".join(costs(params, shapes))
     assert "lmsys/vicuna-7b-v1.5, 13 GB" in said["paper-7b"]
     assert "Host memory" not in said["paper-7b"]
+    # 6.738e9 weights of 2 bytes, in pickles and converted, and CLIP's.
+    ((total, parts),) = re.findall(r"GB: ([\d.]+) in all \((.*)\)", said["paper-7b"])
+    assert f"downloads {1.7 + 4 * 6.738:.0f}" in parts
+    assert float(total) == pytest.approx(sum(float(part) for part in re.findall(r" ([\d.]+)", parts)), abs=1)
+    assert "Hours: 26, " in said["paper-7b"], "one encoder of 6 and four language models of 5"
+    assert "never been run here" in said["paper-7b"]
+    seven = compose("paper-7b")
+    assert "Card: 40 GB" in card(seven, [*count(seven, read_shapes(seven))])
     # 13.016e9 weights of 2 bytes, by transformers' own count of this configuration.
     words = "each of 2 processes loads the whole language model (26 GB) before it keeps its share, 52.1 GB"
     assert words in said["paper-13b"]

@@ -68,7 +68,7 @@ def scale(
     from pipeline.config.params import in_project
     from pipeline.running.stage import running_stages
     from pipeline.scales import check_inputs, compose, prune, write_params
-    from pipeline.scales.cost import costs
+    from pipeline.scales.cost import card, costs
     from pipeline.scales.memory import count, read_shapes, table
 
     in_project()
@@ -79,6 +79,8 @@ def scale(
     # First, since what a scale takes is asked before its weights are fetched.
     if uses := [*count(params, shapes)]:
         typer.echo(f"Memory in GiB on each device, counted from shapes:\n{table(uses)}")
+        if params.runtime.device == "cuda":
+            typer.echo(card(params, uses))
     typer.echo("\n".join([*shapes.notes, *costs(params, shapes)]))
     if plan:
         typer.echo(f"{len(params.ablation.variants())} variants; nothing is written.")

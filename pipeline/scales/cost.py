@@ -1,4 +1,4 @@
-"""What a scale takes besides memory: downloads, disk, and hours where they were measured; before anything runs."""
+"""What a scale takes besides memory: a card, downloads, disk, and hours where they are known; before anything runs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from pathlib import Path
 
 from pipeline.config import Params
 from pipeline.core.records import Encoder, Part
-from pipeline.scales.memory import BYTES, Shapes, launched, trained_parameters
+from pipeline.running.errors import counted
+from pipeline.scales.memory import BYTES, GIB, Shapes, Use, launched, trained_parameters
 from pipeline.training.embeddings import FLIPS
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import list_videos
@@ -19,19 +20,25 @@ from pipeline.weights.check import parameters
 GB = 1e9
 USUAL_FRAMES = 112
 """Frames of a video, which is not opened to count them: the paper's average."""
+PACKAGES, CLIP = 7.5 * GB, 1.7 * GB
+"""What `make install` puts into .venv, and the download of CLIP ViT-L/14 with its text tower."""
+CARDS = (24, 40, 48, 80)
+"""Memory of usual cards, in GB."""
+DRIVERS = {"12": 525, "13": 580}
+"""The oldest NVIDIA driver for Linux, by CUDA's major version (release notes of the CUDA toolkit)."""
 HOURS = {
     "smoke": "0.1 on two cores",
     "finetune": "0.2 of each language model on two cores",
     "rehearsal": "0.4 on two cores (docs/scale.md)",
-    "paper-7b": "6 of the encoder and 5 of each language model, on the paper's RTX A6000",
-    "paper-13b": "6 of the encoder and 6.5 of each language model, on the paper's two RTX A6000",
 }
-"""By scale, as its own settings were measured: here, or by the paper (Yu et al. 2024, section V-C)."""
+"""By scale, as its own settings were measured."""
+PAPER = {"paper-7b": (6, 5, "its RTX A6000"), "paper-13b": (6, 6.5, "its two RTX A6000")}
+"""Hours of the encoder and of a language model's training, on what, by the paper (Yu et al. 2024, section V-C)."""
 
 
 def costs(params: Params, shapes: Shapes) -> Iterator[str]:
     """Lines about downloads, disk, the host's memory, and hours."""
-    place = Path(params.data.dir)
+    place, fetched = Path(params.data.dir), 0.0
     if params.data.source == "scenes":
         objects = [*(params.scenes.objects or shapes.catalogue.objects)] * params.scenes.videos_per_object
     else:
@@ -39,11 +46,14 @@ def costs(params: Params, shapes: Shapes) -> Iterator[str]:
     for folder, llm in ((Path(params.encoder.weights), None), (Path(params.language.weights), shapes.llm)):
         found = next((d for d in DOWNLOADED.values() if d.folder == folder.name), None)
         if found and not folder.is_dir():
-            size = f"{parameters(llm) * 2 / GB:.0f} GB" if llm is not None else "1.7 GB, its text tower included"
-            yield f"Download: {found.repository}, {size}, to {folder} (README, section Real weights)."
+            size, twice = (CLIP, ", its text tower included") if llm is None else (parameters(llm) * 2, ", as pickles")
+            # Pickles are converted into a second folder, and may be removed then.
+            fetched += size if llm is None else 2 * size
+            gigabytes = f"{_round(size / GB)} GB{twice}"
+            yield f"Download: {found.repository}, {gigabytes}, to {folder} (README, section Real weights)."
     if params.data.source == "videos" and not place.is_dir():
         yield f"Videos: {params.data.dir} is not there (README, section Real videos)."
-    yield disk(params, shapes, objects)
+    yield disk(params, shapes, objects, fetched)
     devices, sharded = launched(params.runtime.launcher)
     if shapes.llm is not None and sharded:
         each = parameters(shapes.llm) * BYTES[params.language.dtype] / GB
@@ -51,7 +61,26 @@ def costs(params: Params, shapes: Shapes) -> Iterator[str]:
             f"Host memory: each of {devices} processes loads the whole language model ({each:.3g} GB) before it keeps "
             f"its share, {devices * each:.3g} GB together."
         )
-    yield f"Hours, by the scale's own settings: {HOURS.get(params.scale, 'not measured')}."
+    if params.scale not in PAPER:
+        yield f"Hours, by the scale's own settings: {HOURS.get(params.scale, 'not measured')}."
+        return
+    variants, (tuning, training, card) = params.ablation.variants(), PAPER[params.scale]
+    seeds, models = len(params.ablation.seeds), len({(v.encoder, v.opd, v.seed) for v in variants})
+    yield (
+        f"Hours: {tuning * seeds + training * models:g}, answers not counted, if it is as fast as the paper was on "
+        f"{card}: {tuning} for each of {counted(seeds, 'encoder')}, {training:g} for each of "
+        f"{counted(models, 'language model')}. {params.scale} has never been run here with its real weights."
+    )
+
+
+def card(params: Params, uses: Sequence[Use]) -> str:
+    """Which card, and which driver, a scale for CUDA takes."""
+    import torch
+
+    need = max(use.total for use in uses) + 2 * GIB
+    size = next((f"{size} GB" for size in CARDS if need <= size * GB), "more than 80 GB, so several")
+    oldest = DRIVERS.get(str(torch.version.cuda).partition(".")[0], "(see its CUDA)")
+    return f"Card: {size}, with two GiB more than is counted; NVIDIA driver {oldest} or newer, for the locked torch."
 
 
 def embedded(params: Params, catalogue: Catalogue, objects: Sequence[str]) -> int:
@@ -67,11 +96,21 @@ def embedded(params: Params, catalogue: Catalogue, objects: Sequence[str]) -> in
     return sum(shared if encoder is Encoder.BASE else own for encoder in params.ablation.encoders)
 
 
-def disk(params: Params, shapes: Shapes, objects: Sequence[str]) -> str:
-    """What the chain writes of its own: embeddings, trained models, and the checkpoints of the one that trains."""
+def disk(params: Params, shapes: Shapes, objects: Sequence[str], fetched: float = 0.0) -> str:
+    """All that lies on the disk in the end, and beside it while something is made.
+
+    Args:
+        fetched: Bytes of downloads that are not there yet, twice those that are converted.
+    """
     rows, variants = embedded(params, shapes.catalogue, objects), params.ablation.variants()
-    total = rows * 4 * shapes.embedding
-    parts = [f"embeddings {_round(total / GB)}" if rows else "embeddings not known without the videos"]
+    total: float = rows * 4 * shapes.embedding
+    videos = sum(f.stat().st_size for f in Path(params.data.dir).rglob("*") if f.is_file())
+    frames = params.scenes.frames if params.data.source == "scenes" else USUAL_FRAMES
+    pictures = len(objects) * kept_count(frames, params.frames) * 3 * params.frames.pixels**2
+    parts = [f"embeddings {_round(total / GB)}" if rows else "embeddings and frames not known without the videos"]
+    total += PACKAGES + fetched + pictures + videos
+    parts += [f"frames {_round(pictures / GB)}, videos {_round(videos / GB)}"] if rows else []
+    parts += [f"packages {_round(PACKAGES / GB)}", *([f"downloads {_round(fetched / GB)}"] if fetched else [])]
     if shapes.llm is not None:
         connector, words, adapters = trained_parameters(params, shapes.llm, shapes.embedding)
         aligned, adapted = len({(v.encoder, v.opd, v.seed) for v in variants}), sum(v.lora == "with" for v in variants)
@@ -81,8 +120,7 @@ def disk(params: Params, shapes: Shapes, objects: Sequence[str]) -> str:
         parts += [f"data/models {_round(models / GB)}", f"checkpoints {_round(checkpoints / GB)} while one trains"]
         total += models + checkpoints
     return (
-        f"Disk in GB: {_round(total / GB)} besides videos and downloads ({', '.join(parts)}); DVC's cache links to the "
-        "same files where the disk allows."
+        f"Disk in GB: {_round(total / GB)} in all ({', '.join(parts)}), where DVC's cache can link to the same files."
     )
 
 
