@@ -70,7 +70,7 @@ def test_ctrl_c_is_one_line(project: Path, monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_clone_whose_chain_is_up_to_date_is_published_once(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_params(compose("smoke"))
     calls: list[object] = []
-    monkeypatch.setattr("pipeline.cli.reproduce.outdated", lambda _: (0, 16))
+    monkeypatch.setattr("pipeline.cli.reproduce.outdated", lambda _: ([], 16, True))
     monkeypatch.setattr("dvc.cli.main", lambda _: 0)
     monkeypatch.setattr("pipeline.tracking.publish.publish", calls.append)
     for arguments, published in ((["--dry"], 0), ([], 1)):
@@ -80,6 +80,13 @@ def test_a_clone_whose_chain_is_up_to_date_is_published_once(project: Path, monk
     (project / "mlruns" / "mlflow.db").touch()
     assert RUNNER.invoke(app, ["repro"]).exit_code == 0
     assert len(calls) == 1
+
+
+def test_a_dry_run_lists_what_waits_where_outputs_are_missing(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_params(compose("smoke"))
+    monkeypatch.setattr("dvc.cli.main", lambda _: pytest.fail("it ends where a file is missing"))
+    monkeypatch.setattr("pipeline.cli.reproduce.outdated", lambda _: (["split", "grade"], 16, False))
+    assert RUNNER.invoke(app, ["repro", "--dry"]).output.splitlines()[1:] == ["split", "grade"]
 
 
 def lines(output: str, severity: str) -> list[str]:

@@ -100,7 +100,12 @@ def compare(root: Path, old: str, new: str = "") -> dict[str, Any]:
                 for file, changes in said.get("diff", {}).items()
                 for name, change in changes.items()
             ]
+        answers = [stage.addressing for stage in repo.index.stages if stage.name == "grade"]
+        stale = repo.status(targets=answers, with_deps=True) if answers and not new else {}
     found["tested"], notes = _tested(one, two)
+    if stale:
+        first = f"{min(stale)}{' and more' if len(stale) > 1 else ''}"
+        notes.append(f"The answers on disk are stale ({first} changed since); `octopi repro` makes them anew.")
     return {"old": one.name, "new": two.name, "differs": any(found.values()), **found, "notes": notes}
 
 

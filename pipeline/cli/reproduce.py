@@ -12,8 +12,8 @@ INTERRUPTED = ("exited with 130", "exited with -2")
 """How DVC's error ends for a stage that Ctrl-C ended, the second where it had hardly begun or was at its end."""
 
 
-def outdated(root: Path) -> tuple[int, int]:
-    """How many stages will run at the most, and how many there are.
+def outdated(root: Path) -> tuple[list[str], int, bool]:
+    """The stages that will run at the most, in their order, how many there are, and whether all outputs are there.
 
     A stage runs where its inputs changed, and every stage after it unless its own inputs come out the same.
 
@@ -35,7 +35,9 @@ def outdated(root: Path) -> tuple[int, int]:
         raise UserError(f"{' '.join(str(error).split())}; {back if 'dvc.lock' in str(error) else 'mend it'}") from None
     started = [stage for stage in graph if stage.addressing in changed]
     waiting = set(started).union(*(nx.ancestors(graph, stage) for stage in started))
-    return len(waiting), sum(stage.path_in_repo == str(CHAIN) for stage in graph)
+    order = [stage.addressing for stage in nx.dfs_postorder_nodes(graph) if stage in waiting]
+    whole = all(Path(out.fs_path).exists() for stage in graph for out in stage.outs)
+    return order, sum(stage.path_in_repo == str(CHAIN) for stage in graph), whole
 
 
 def reproduce(root: Path, arguments: list[str]) -> int:
@@ -55,9 +57,13 @@ def reproduce(root: Path, arguments: list[str]) -> int:
         return not stopped
 
     params = load_params(root / "params.yaml")
-    name, (waiting, total) = params.report_name, outdated(root)
+    name, (waiting, total, whole) = params.report_name, outdated(root)
     if waiting:
-        print(f"{name}: up to {waiting} of {total} stages will run", flush=True)
+        print(f"{name}: up to {len(waiting)} of {total} stages will run", flush=True)
+    if not whole and arguments == ["--dry"]:
+        # DVC's own ends where a stage that is not run now has left nothing for the next one.
+        print("\n".join(waiting))
+        return 0
     if waiting or arguments:
         for handler in logging.getLogger("dvc").handlers:
             handler.addFilter(shown)
@@ -73,4 +79,7 @@ def reproduce(root: Path, arguments: list[str]) -> int:
         attempt(params.tracking, publish, params)
     print(f"Report: reports/{name}/README.md; all reports on one page: reports/index.html")
     print("Dashboard: make dashboard, then open the link to all variants that it prints after ten seconds")
+    if waiting:
+        kept = f"git add dvc.lock params.yaml reports && git commit -m '{name}'"
+        print(f"Keep this run, which Git does not know yet: {kept} (docs/dashboard.md: how to go back)")
     return 0

@@ -150,6 +150,10 @@ def test_the_working_tree_is_what_lies_on_disk(copy: History) -> None:
     assert found["parameters"] == [{"name": "epochs", "old": "5", "new": "6"}]
     assert found["metrics"] == [{"name": "smoke-scenes.PC", "old": "None", "new": "1.0"}]
     assert found["tested"] == []
+    (note,) = found["notes"]
+    assert re.search(r"stale \(.*grade changed since\); `octopi repro`", note), (
+        "epochs is a parameter of what is graded"
+    )
 
 
 def test_a_broken_file_is_named(copy: History) -> None:
