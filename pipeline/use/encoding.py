@@ -54,6 +54,15 @@ class Classified(NamedTuple):
     """The predicted classes."""
 
 
+class Verdict(NamedTuple):
+    """What follows from the property heads by a plain rule, without the language model."""
+
+    said: str
+    """Worded as a right answer is."""
+    shown: str
+    """With the classes, and their probabilities or expected classes."""
+
+
 class VideoEncoder:
     """The tactile encoder and heads of a folder, with what embeddings are standardised by."""
 

@@ -28,23 +28,11 @@ from pipeline.running.progress import quiet_libraries
 from pipeline.tasks import opd, pc, pom, psr, pss
 from pipeline.tasks.base import LETTERS, conclusion
 from pipeline.training.card import front_matter
-from pipeline.use.encoding import Classified, EncodedVideo, VideoEncoder
+from pipeline.use.encoding import Classified, EncodedVideo, Verdict, VideoEncoder
 from pipeline.use.folder import ENCODER_DIR, FITTED, ModelConfig, chat_sample, find_base, find_property, read_folder
-from pipeline.use.frames import name_of
 from pipeline.use.hub import HUB, download
 from pipeline.use.memory import Remembered, most_similar, recall, remember
-from pipeline.use.results import (
-    Choice,
-    Comparison,
-    Description,
-    Exchange,
-    Matching,
-    Ranking,
-    Recognition,
-    Touch,
-    Verdict,
-    Video,
-)
+from pipeline.use.results import Choice, Comparison, Description, Exchange, Matching, Ranking, Recognition, Touch, Video
 from pipeline.videos.catalogue import Catalogue, Object
 from pipeline.videos.catalogue.wording import mentioned
 from pipeline.videos.files import video_files
@@ -312,11 +300,8 @@ class Octopi:
     def table(self, videos: Path | str | Sequence[Path | str]) -> pd.DataFrame:
         """Descriptions of videos, or of those of folders: the table that `octopi describe --csv` writes."""
         # Named, not imported: the stage `evaluate` imports this file, and makes no such table.
-        listed = importlib.import_module("pipeline.use.ask")
-        found: pd.DataFrame = listed.table(
-            self, [Path(v) for v in ([videos] if isinstance(videos, (str, Path)) else videos)]
-        )
-        return found
+        paths = [Path(v) for v in ([videos] if isinstance(videos, (str, Path)) else videos)]
+        return importlib.import_module("pipeline.use.ask").table(self, paths)
 
     def compare(self, a: Video, b: Video, property: str) -> Comparison:
         """Whether the first video is more of a property ("hardness", "harder") than the second, or less ("softer")."""
@@ -363,7 +348,6 @@ class Octopi:
         return Ranking(
             property=known.name,
             levels=known.levels,
-            videos=tuple(map(name_of, videos)),
             order=tuple(order),
             expected=tuple(expected),
             answer=answer,
@@ -546,9 +530,8 @@ def on_real_videos(folder: Path) -> str:
     results = ModelCardData(ignore_metadata_errors=True, **front_matter(folder)).eval_results or []
     for r in results:
         if r.dataset_type == REAL and r.dataset_config == "OPD" and r.metric_args:
-            right, low, high, chance = (
-                100 * x for x in (r.metric_value, *(r.metric_args[key] for key in ("low", "high", "chance")))
-            )
+            told = {"value": r.metric_value, **r.metric_args}
+            right, low, high, chance = (100 * told[key] for key in ("value", "low", "high", "chance"))
             return f"of real videos it describes {right:.1f} % [{low:.1f}, {high:.1f}] right (guessing {chance:.1f} %)"
     return "what it reaches on real videos was not measured"
 

@@ -12,7 +12,7 @@ from pydantic import AliasChoices, BaseModel, BeforeValidator, Field, Validation
 
 from pipeline.language.chat import TACTILE
 from pipeline.running.errors import UserError, first_problem
-from pipeline.use.results import Verdict
+from pipeline.use.encoding import Verdict
 
 MESSAGES, CHARACTERS = 64, 20_000
 """The longest conversation, and the longest text of one part of it."""

@@ -17,15 +17,6 @@ Video = str | os.PathLike[str] | Pictures
 """A file, or uint8, frames x height x width x RGB."""
 
 
-class Verdict(NamedTuple):
-    """What follows from the property heads by a plain rule, without the language model."""
-
-    said: str
-    """Worded as a right answer is."""
-    shown: str
-    """With the classes, and their probabilities or expected classes."""
-
-
 class Exchange(NamedTuple):
     """One turn of a conversation. The caller keeps the list of them; the model remembers nothing."""
 
@@ -93,8 +84,6 @@ class Ranking(Record):
     property: str
     levels: tuple[str, ...]
     """The property's classes, least first."""
-    videos: tuple[str, ...]
-    """Their names, in the order that they were given in."""
     order: tuple[int, ...]
     """Places in the list of videos, from 0, by the heads' expected class, smallest first."""
     expected: tuple[float, ...]

@@ -19,7 +19,10 @@ GET_CLIP = (
     "get CLIP ViT-L/14 with `hf download timm/vit_large_patch14_clip_224.openai --local-dir {folder}`, or set "
     "encoder.weights=data/weights/tiny-clip"
 )
-GET_TIMM = "set encoder.weights=data/weights/efficientnet-lite0, or save a timm model with timm.models.save_for_hf"
+GET_TIMM = (
+    "set encoder.weights=data/weights/efficientnet-lite0, or save a timm model with "
+    "timm.models.save_for_hf(model, '{folder}', safe_serialization=True)"
+)
 
 
 def clip_file(folder: Path) -> Path:

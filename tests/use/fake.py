@@ -15,9 +15,10 @@ from typing import Any
 
 from pipeline.config import FramesConfig
 from pipeline.running.errors import UserError
+from pipeline.use.encoding import Verdict
 from pipeline.use.frames import read_touch
 from pipeline.use.model import with_marks
-from pipeline.use.results import Description, Touch, Verdict, Video
+from pipeline.use.results import Description, Touch, Video
 from pipeline.use.server import listen, make_server
 from tests.conftest import HUNG
 from tests.use.videos import uri

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from functools import partial
 from importlib import metadata
@@ -10,12 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import timm
 import torch
 from safetensors.torch import load_file, save_file
 from transformers import AutoConfig, AutoModelForCausalLM
 
 from pipeline.encoder.recipes import base_encoder, check_recipe
 from pipeline.language.base import load_llm, load_tokenizer
+from pipeline.running.errors import UserError
 from pipeline.weights import MADE_DIR, check_language
 from pipeline.weights.backbones import check_encoder
 from pipeline.weights.check import check_encoder_files, check_language_files
@@ -196,3 +199,12 @@ def test_a_broken_folder_is_one_line_at_loading_too(kind: str, damage: Callable[
             load_llm(folder, torch.float32)
         else:
             base_encoder(config(folder, "tuned", backbone=(kind,)))
+
+
+def test_a_timm_model_that_is_saved_as_the_mend_says_is_taken(tmp_path: Path) -> None:
+    folder = tmp_path / "timm"
+    with pytest.raises(UserError) as refusal:
+        check_encoder(folder, 64, ["timm"])
+    (call,) = re.findall(r"(timm\.models\.save_for_hf\(.*?\)) \(", str(refusal.value))
+    eval(call, {"timm": timm, "model": timm.create_model("test_efficientnet", pretrained=False)})
+    check_encoder(folder, 64, ["timm"])
