@@ -90,6 +90,21 @@ def test_ctrl_c_ends_the_processes_of_a_stage(tmp_path: Path, body: str) -> None
     assert interrupted(tmp_path, sys.executable, "stages/slow.py") == (130, [STOPPED])
 
 
+@pytest.mark.parametrize(("end", "status"), [("", 0), ("raise UserError('no')", 1), ("1 / 0", 1), ("sys.exit(3)", 3)])
+def test_a_stage_ends_at_once_where_it_ended_well(here: Path, end: str, status: int) -> None:
+    """What libraries do at the end is done, what was printed is shown, and another end keeps its status."""
+    code = "import atexit, sys\nfrom pipeline.running.errors import UserError\n"
+    code += "class Late:\n    def __del__(self): print('apart')\nlate = Late()\natexit.register(print, 'library')\n"
+    code += "from pipeline.running.stage import stage\n"
+    (here / "stages").mkdir()
+    (here / "stages/slow.py").write_text(f"{code}with stage('slow'):\n    print('body')\n    {end}\n")
+    command = [sys.executable, "stages/slow.py"]
+    done = subprocess.run(command, env=ENVIRONMENT, text=True, capture_output=True, check=False)
+    assert done.returncode == status, done.stderr
+    said = [line for line in done.stdout.splitlines() if not line.startswith("slow: ")]
+    assert said == ["body", "library", *(["apart"] if status else [])]
+
+
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_no_worker_outlives_its_parent(tmp_path: Path, number: signal.Signals) -> None:
     parent = launch(tmp_path, sys.executable, "-c", f"import time\n{SLEEPING}", errors=subprocess.DEVNULL)
