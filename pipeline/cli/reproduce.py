@@ -2,18 +2,43 @@
 
 from __future__ import annotations
 
+import csv
 import logging
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import NamedTuple
 
 from pipeline.config.params import CHAIN, load_params
+from pipeline.core.runtime import cores
 from pipeline.running.errors import UserError
+from pipeline.tasks import TASKS
 
 INTERRUPTED = ("exited with 130", "exited with -2")
 """How DVC's error ends for a stage that Ctrl-C ended, the second where it had hardly begun or was at its end."""
 
 
-def outdated(root: Path) -> tuple[int, int]:
-    """How many stages will run at the most, and how many there are.
+TAKES = {"smoke": "about five minutes on two cores, and 50 MB of disk"}
+"""By scale, what a whole run was measured to take."""
+APART = ("align", "lora", "answer", "evaluate")
+"""Stages of which several may run at once."""
+
+
+class Outdated(NamedTuple):
+    """What will run at the most."""
+
+    waiting: int
+    total: int
+    trunk: Sequence[str] = ()
+    """What comes before the first of `branches`."""
+    branches: Sequence[Sequence[str]] = ()
+    """Stages in order, those of one branch needing nothing of another's."""
+
+
+def outdated(root: Path) -> Outdated:
+    """How many stages will run at the most, how many there are, and which may run side by side.
 
     A stage runs where its inputs changed, and every stage after it unless its own inputs come out the same.
 
@@ -35,7 +60,38 @@ def outdated(root: Path) -> tuple[int, int]:
         raise UserError(f"{' '.join(str(error).split())}; {back if 'dvc.lock' in str(error) else 'mend it'}") from None
     started = [stage for stage in graph if stage.addressing in changed]
     waiting = set(started).union(*(nx.ancestors(graph, stage) for stage in started))
-    return len(waiting), sum(stage.path_in_repo == str(CHAIN) for stage in graph)
+    own = [s for s in nx.dfs_postorder_nodes(graph) if s in waiting and s.name.partition("@")[0] in APART]
+    parts = nx.weakly_connected_components(graph.subgraph(own))
+    branches = sorted(([s.addressing for s in own if s in part] for part in parts), key=len, reverse=True)
+    trunk = {before.addressing for s in own for before in graph.successors(s)} - {s.addressing for s in own}
+    total = sum(stage.path_in_repo == str(CHAIN) for stage in graph)
+    return Outdated(len(waiting), total, sorted(trunk), branches)
+
+
+def run_branches(branches: Sequence[Sequence[str]], at_once: int) -> None:
+    """Run each branch by a `dvc` of its own, as DVC runs one stage at a time; what fails is left to who comes next."""
+    # Quiet: of what goes wrong the stage itself says a line, and the whole chain is looked through behind.
+    command = [sys.executable, "-m", "dvc", "repro", "--quiet", "--wait-for-lock", "--single-item"]
+    with ThreadPoolExecutor(at_once) as pool:
+        try:
+            list(pool.map(lambda branch: subprocess.run([*command, *branch], check=False), branches))
+        except KeyboardInterrupt:  # The running ones have got it, too.
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def right_answers(file: Path, models: Sequence[str]) -> Iterator[str]:
+    """A line a task of scores.csv: what the first trained model that it has, else the full system, answered right."""
+    with file.open(newline="", encoding="utf-8") as stream:
+        rows = [r for r in csv.DictReader(stream) if r["seed"] == "all" and r["measure"] in ("choice", "combined")]
+    whose = ("finetuned", "with", "all", "real")
+    rows = [r for r in rows if (*models, "")[0] == r["encoder"] and r["touch"] == "touch"] or [
+        r for r in rows if (r["encoder"], r["lora"], r["opd"], r["touch"]) == whose
+    ]
+    for row in sorted(rows, key=lambda r: [*TASKS].index(r["task"])):
+        right, low, high, chance = (f"{100 * float(row[key]):.0f}" for key in ("accuracy", "low", "high", "chance"))
+        what = f"{TASKS[row['task']].title}: {right} % right [{low}, {high}] of {row['n']}, guessing {chance}"
+        yield f"  {row['encoder'] if models else 'full system'}, {what}"
 
 
 def reproduce(root: Path, arguments: list[str]) -> int:
@@ -55,13 +111,23 @@ def reproduce(root: Path, arguments: list[str]) -> int:
         return not stopped
 
     params = load_params(root / "params.yaml")
-    name, (waiting, total) = params.report_name, outdated(root)
+    name, found = params.report_name, outdated(root)
+    waiting, total = found.waiting, found.total
     if waiting:
-        print(f"{name}: up to {waiting} of {total} stages will run", flush=True)
+        whole = TAKES.get(params.scale)
+        print(f"{name}: up to {waiting} of {total} stages will run{f'; all take {whole}' if whole else ''}", flush=True)
     if waiting or arguments:
         for handler in logging.getLogger("dvc").handlers:
             handler.addFilter(shown)
-        status = int(dvc(["repro", *arguments]))
+        runtime, status = params.runtime, 0
+        # Where each takes so many threads of a processor, and not a GPU or the threads that torch chooses.
+        alone = runtime.device != "cpu" or runtime.launcher != "python" or not runtime.threads
+        at_once = 1 if alone or arguments else min(len(found.branches), cores() // runtime.threads)
+        if at_once > 1:
+            status = int(dvc(["repro", *found.trunk]))
+            if not status:
+                run_branches(found.branches, at_once)
+        status = status or int(dvc(["repro", *arguments]))
         if stopped and isinstance(stopped[0], KeyboardInterrupt):
             raise KeyboardInterrupt
         if status:
@@ -71,6 +137,9 @@ def reproduce(root: Path, arguments: list[str]) -> int:
     if not (arguments or params.tracking.uri or (MLRUNS / "mlflow.db").is_file()):
         # A clone has the lock of a chain that ran elsewhere, so that DVC does not publish it; MLflow has nothing yet.
         attempt(params.tracking, publish, params)
+    if (scores := root / "reports" / name / "scores.csv").is_file():
+        print(f"{name}, with 95 % intervals over objects:", *right_answers(scores, params.evaluate.models), sep="\n")
     print(f"Report: reports/{name}/README.md; all reports on one page: reports/index.html")
     print("Dashboard: make dashboard, then open http://127.0.0.1:5000")
+    print('Ask the shipped model: octopi ask "Which is softer?" examples/soft.mp4 examples/hard.mp4')
     return 0
