@@ -27,20 +27,18 @@ APART = ("align", "lora", "answer", "evaluate")
 
 
 class Outdated(NamedTuple):
-    """What will run at the most."""
+    """How many stages will run at the most, how many there are, and which may run side by side."""
 
     waiting: int
     total: int
     trunk: Sequence[str] = ()
-    """What comes before the first of `branches`."""
+    """What runs before any branch does."""
     branches: Sequence[Sequence[str]] = ()
-    """Stages in order, those of one branch needing nothing of another's."""
+    """Stages in order; none needs one of another branch."""
 
 
 def outdated(root: Path) -> Outdated:
-    """How many stages will run at the most, how many there are, and which may run side by side.
-
-    A stage runs where its inputs changed, and every stage after it unless its own inputs come out the same.
+    """A stage runs where its inputs changed, and every stage after it unless its own inputs come out the same.
 
     Raises:
         UserError: where DVC cannot read its own files: one that is killed while it writes dvc.lock leaves half of it.
@@ -80,18 +78,15 @@ def run_branches(branches: Sequence[Sequence[str]], at_once: int) -> None:
             raise
 
 
-def right_answers(file: Path, models: Sequence[str]) -> Iterator[str]:
-    """A line a task of scores.csv: what the first trained model that it has, else the full system, answered right."""
+def right_answers(file: Path, model: str | None) -> Iterator[str]:
+    """A line a task of scores.csv: what a trained model that was asked got right; without one, the full system."""
+    whose = (model, "", "touch") if model else ("finetuned", "with", "real")
     with file.open(newline="", encoding="utf-8") as stream:
-        rows = [r for r in csv.DictReader(stream) if r["seed"] == "all" and r["measure"] in ("choice", "combined")]
-    whose = ("finetuned", "with", "all", "real")
-    rows = [r for r in rows if (*models, "")[0] == r["encoder"] and r["touch"] == "touch"] or [
-        r for r in rows if (r["encoder"], r["lora"], r["opd"], r["touch"]) == whose
-    ]
-    for row in sorted(rows, key=lambda r: [*TASKS].index(r["task"])):
-        right, low, high, chance = (f"{100 * float(row[key]):.0f}" for key in ("accuracy", "low", "high", "chance"))
-        what = f"{TASKS[row['task']].title}: {right} % right [{low}, {high}] of {row['n']}, guessing {chance}"
-        yield f"  {row['encoder'] if models else 'full system'}, {what}"
+        rows = [r for r in csv.DictReader(stream) if (r["encoder"], r["lora"], r["touch"]) == whose]
+    found = {r["task"]: r for r in rows if r["seed"] == "all" and r["measure"] in ("choice", "combined")}
+    for name in (task for task in TASKS if task in found):
+        right, low, high, chance = (f"{100 * float(found[name][k]):.0f}" for k in ("accuracy", "low", "high", "chance"))
+        yield f"  {TASKS[name].title}: {right} % right [{low}, {high}] of {found[name]['n']}, guessing {chance}"
 
 
 def reproduce(root: Path, arguments: list[str]) -> int:
@@ -112,33 +107,32 @@ def reproduce(root: Path, arguments: list[str]) -> int:
 
     params = load_params(root / "params.yaml")
     name, found = params.report_name, outdated(root)
-    waiting, total = found.waiting, found.total
-    if waiting:
-        whole = TAKES.get(params.scale)
-        print(f"{name}: up to {waiting} of {total} stages will run{f'; all take {whole}' if whole else ''}", flush=True)
-    if waiting or arguments:
+    if found.waiting:
+        takes = f"; all take {TAKES[params.scale]}" if params.scale in TAKES else ""
+        print(f"{name}: up to {found.waiting} of {found.total} stages will run{takes}", flush=True)
+    if found.waiting or arguments:
         for handler in logging.getLogger("dvc").handlers:
             handler.addFilter(shown)
+        # Side by side only where each takes so many threads of the processor, not a GPU nor what threads torch chooses.
         runtime, status = params.runtime, 0
-        # Where each takes so many threads of a processor, and not a GPU or the threads that torch chooses.
-        alone = runtime.device != "cpu" or runtime.launcher != "python" or not runtime.threads
-        at_once = 1 if alone or arguments else min(len(found.branches), cores() // runtime.threads)
-        if at_once > 1:
+        places = cores() // runtime.threads if runtime.threads and runtime.device == "cpu" and not arguments else 1
+        if min(places, len(found.branches)) > 1:
             status = int(dvc(["repro", *found.trunk]))
             if not status:
-                run_branches(found.branches, at_once)
+                run_branches(found.branches, places)
         status = status or int(dvc(["repro", *arguments]))
         if stopped and isinstance(stopped[0], KeyboardInterrupt):
             raise KeyboardInterrupt
         if status:
             return 130 if stopped else status
     else:
-        print(f"{name}: all {total} stages are up to date")
+        print(f"{name}: all {found.total} stages are up to date")
     if not (arguments or params.tracking.uri or (MLRUNS / "mlflow.db").is_file()):
         # A clone has the lock of a chain that ran elsewhere, so that DVC does not publish it; MLflow has nothing yet.
         attempt(params.tracking, publish, params)
     if (scores := root / "reports" / name / "scores.csv").is_file():
-        print(f"{name}, with 95 % intervals over objects:", *right_answers(scores, params.evaluate.models), sep="\n")
+        model = next(iter(params.evaluate.models), None)
+        print(f"{model or 'The full system'}, with 95 % intervals:", *right_answers(scores, model), sep="\n")
     print(f"Report: reports/{name}/README.md; all reports on one page: reports/index.html")
     print("Dashboard: make dashboard, then open http://127.0.0.1:5000")
     print('Ask the shipped model: octopi ask "Which is softer?" examples/soft.mp4 examples/hard.mp4')
