@@ -10,7 +10,6 @@ import pytest
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.cli.reproduce import Outdated
 from pipeline.config.params import load_params
 from pipeline.scales import compose, write_params
 from tests.closure import ROOT
@@ -71,7 +70,7 @@ def test_ctrl_c_is_one_line(project: Path, monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_clone_whose_chain_is_up_to_date_is_published_once(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_params(compose("smoke"))
     calls: list[object] = []
-    monkeypatch.setattr("pipeline.cli.reproduce.outdated", lambda _: Outdated(0, 16))
+    monkeypatch.setattr("pipeline.cli.reproduce.outdated", lambda _: (0, 16, []))
     monkeypatch.setattr("dvc.cli.main", lambda _: 0)
     monkeypatch.setattr("pipeline.tracking.publish.publish", calls.append)
     for arguments, published in ((["--dry"], 0), ([], 1)):

@@ -16,6 +16,7 @@ import pytest
 import yaml
 
 from pipeline.core.io import atomic_folder
+from pipeline.core.runtime import cores
 from pipeline.running.stage import stage
 from pipeline.scales import compose, write_params
 from tests.closure import ROOT
@@ -81,6 +82,32 @@ def test_ctrl_c_in_a_chain_is_one_line_and_what_is_finished_stays(here: Path, bo
     _, lines = interrupted(here, "dvc", "repro")
     assert lines[0] == STOPPED
     assert [line.split(":")[0] for line in lines[1:]] == ["ERROR"], "DVC's own"
+
+
+BRANCHES = """\
+stages:
+  embed: {cmd: touch embed, outs: [embed]}
+  questions: {cmd: touch questions, outs: [questions]}
+  align:
+    matrix: {v: [a, b]}
+    cmd: echo ${item.v} >> begun; touch ${item.v}; for i in $(seq 60); do [ -e a -a -e b ] && exit; sleep 1; done; exit 1
+    deps: [embed]
+    outs: ['${item.v}']
+  answer: {matrix: {v: [a, b]}, cmd: "cp ${item.v} ${item.v}2", deps: ["${item.v}", questions], outs: ["${item.v}2"]}
+  report: {cmd: cat a2 b2 > report, deps: [a2, b2], outs: [report]}
+"""
+
+
+@pytest.mark.skipif(cores() < 2, reason="needs two cores")
+def test_variants_run_side_by_side_and_all_is_in_the_lock(here: Path) -> None:
+    """Each `align` waits for the other one: of DVC alone it would fail, and run again."""
+    (here / "dvc.yaml").write_text(BRANCHES)
+    subprocess.run(f"git init -q && '{sys.executable}' -m dvc init -q", shell=True, check=True)
+    subprocess.run(["octopi", "repro"], env=ENVIRONMENT, check=True)
+    locked = yaml.safe_load((here / "dvc.lock").read_text())["stages"]
+    assert sorted((here / "begun").read_text().split()) == ["a", "b"], "once each"
+    assert set(locked) == {"embed", "questions", "align@a", "align@b", "answer@a", "answer@b", "report"}
+    assert "up to date" in subprocess.check_output(["dvc", "status"], text=True, env=ENVIRONMENT)
 
 
 @pytest.mark.parametrize("body", [SLEEPING, TELLING])

@@ -9,7 +9,6 @@ import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
 
 from pipeline.config.params import CHAIN, load_params
 from pipeline.core.runtime import cores
@@ -22,23 +21,14 @@ INTERRUPTED = ("exited with 130", "exited with -2")
 
 TAKES = {"smoke": "about five minutes on two cores, and 50 MB of disk"}
 """By scale, what a whole run was measured to take."""
-APART = ("align", "lora", "answer", "evaluate")
-"""Stages of which several may run at once."""
+TRUNK, APART = ("embed", "questions"), ("align", "lora", "answer", "evaluate")
+"""What runs before any stage of which several may run at once, and those."""
 
 
-class Outdated(NamedTuple):
-    """How many stages will run at the most, how many there are, and which may run side by side."""
+def outdated(root: Path) -> tuple[int, int, list[list[str]]]:
+    """How many stages will run at the most, how many there are, and branches: none needs a stage of another.
 
-    waiting: int
-    total: int
-    trunk: Sequence[str] = ()
-    """What runs before any branch does."""
-    branches: Sequence[Sequence[str]] = ()
-    """Stages in order; none needs one of another branch."""
-
-
-def outdated(root: Path) -> Outdated:
-    """A stage runs where its inputs changed, and every stage after it unless its own inputs come out the same.
+    A stage runs where its inputs changed, and every stage after it unless its own inputs come out the same.
 
     Raises:
         UserError: where DVC cannot read its own files: one that is killed while it writes dvc.lock leaves half of it.
@@ -61,21 +51,15 @@ def outdated(root: Path) -> Outdated:
     own = [s for s in nx.dfs_postorder_nodes(graph) if s in waiting and s.name.partition("@")[0] in APART]
     parts = nx.weakly_connected_components(graph.subgraph(own))
     branches = sorted(([s.addressing for s in own if s in part] for part in parts), key=len, reverse=True)
-    trunk = {before.addressing for s in own for before in graph.successors(s)} - {s.addressing for s in own}
-    total = sum(stage.path_in_repo == str(CHAIN) for stage in graph)
-    return Outdated(len(waiting), total, sorted(trunk), branches)
+    return len(waiting), sum(stage.path_in_repo == str(CHAIN) for stage in graph), branches
 
 
 def run_branches(branches: Sequence[Sequence[str]], at_once: int) -> None:
     """Run each branch by a `dvc` of its own, as DVC runs one stage at a time; what fails is left to who comes next."""
     # Quiet: of what goes wrong the stage itself says a line, and the whole chain is looked through behind.
-    command = [sys.executable, "-m", "dvc", "repro", "--quiet", "--wait-for-lock", "--single-item"]
+    command = [sys.executable, "-m", "dvc", "--wait-for-lock", "repro", "--quiet", "--single-item"]
     with ThreadPoolExecutor(at_once) as pool:
-        try:
-            list(pool.map(lambda branch: subprocess.run([*command, *branch], check=False), branches))
-        except KeyboardInterrupt:  # The running ones have got it, too.
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+        list(pool.map(lambda branch: subprocess.run([*command, *branch], check=False), branches))
 
 
 def right_answers(file: Path, model: str | None) -> Iterator[str]:
@@ -106,27 +90,27 @@ def reproduce(root: Path, arguments: list[str]) -> int:
         return not stopped
 
     params = load_params(root / "params.yaml")
-    name, found = params.report_name, outdated(root)
-    if found.waiting:
+    name, (waiting, total, branches) = params.report_name, outdated(root)
+    if waiting:
         takes = f"; all take {TAKES[params.scale]}" if params.scale in TAKES else ""
-        print(f"{name}: up to {found.waiting} of {found.total} stages will run{takes}", flush=True)
-    if found.waiting or arguments:
+        print(f"{name}: up to {waiting} of {total} stages will run{takes}", flush=True)
+    if waiting or arguments:
         for handler in logging.getLogger("dvc").handlers:
             handler.addFilter(shown)
         # Side by side only where each takes so many threads of the processor, not a GPU nor what threads torch chooses.
         runtime, status = params.runtime, 0
         places = cores() // runtime.threads if runtime.threads and runtime.device == "cpu" and not arguments else 1
-        if min(places, len(found.branches)) > 1:
-            status = int(dvc(["repro", *found.trunk]))
+        if min(places, len(branches)) > 1:
+            status = int(dvc(["repro", *TRUNK]))
             if not status:
-                run_branches(found.branches, places)
+                run_branches(branches, places)
         status = status or int(dvc(["repro", *arguments]))
         if stopped and isinstance(stopped[0], KeyboardInterrupt):
             raise KeyboardInterrupt
         if status:
             return 130 if stopped else status
     else:
-        print(f"{name}: all {found.total} stages are up to date")
+        print(f"{name}: all {total} stages are up to date")
     if not (arguments or params.tracking.uri or (MLRUNS / "mlflow.db").is_file()):
         # A clone has the lock of a chain that ran elsewhere, so that DVC does not publish it; MLflow has nothing yet.
         attempt(params.tracking, publish, params)
