@@ -19,7 +19,7 @@ INTERRUPTED = ("exited with 130", "exited with -2")
 """How DVC's error ends for a stage that Ctrl-C ended, the second where it had hardly begun or was at its end."""
 
 
-TAKES = {"smoke": "about five minutes on two cores, and 50 MB of disk"}
+TAKES = {"smoke": "six minutes on two cores, and 50 MB of disk"}
 """By scale, what a whole run was measured to take."""
 TRUNK, APART = ("embed", "questions"), ("align", "lora", "answer", "evaluate")
 """What runs before any stage of which several may run at once, and those."""
