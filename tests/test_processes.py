@@ -121,8 +121,8 @@ def test_ctrl_c_ends_the_processes_of_a_stage(tmp_path: Path, body: str) -> None
 def test_a_stage_ends_at_once_where_it_ended_well(here: Path, end: str, status: int) -> None:
     """What libraries do at the end is done, what was printed is shown, and another end keeps its status."""
     code = "import atexit, sys\nfrom pipeline.running.errors import UserError\n"
-    code += "class Late:\n    def __del__(self): print('apart')\nlate = Late()\natexit.register(print, 'library')\n"
-    code += "from pipeline.running.stage import stage\n"
+    code += "from pipeline.running.stage import stage\nclass Late:\n    def __del__(self): print('apart')\n"
+    code += "late = Late()\natexit.register(print, 'library')\n"
     (here / "stages").mkdir()
     (here / "stages/slow.py").write_text(f"{code}with stage('slow'):\n    print('body')\n    {end}\n")
     command = [sys.executable, "stages/slow.py"]
