@@ -70,7 +70,7 @@ def test_ctrl_c_is_one_line(project: Path, monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_clone_whose_chain_is_up_to_date_is_published_once(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_params(compose("smoke"))
     calls: list[object] = []
-    monkeypatch.setattr("pipeline.cli.reproduce.outdated", lambda _: ([], 16, True))
+    monkeypatch.setattr("pipeline.cli.reproduce.outdated", lambda _: ({}, 16, True))
     monkeypatch.setattr("dvc.cli.main", lambda _: 0)
     monkeypatch.setattr("pipeline.tracking.publish.publish", calls.append)
     for arguments, published in ((["--dry"], 0), ([], 1)):

@@ -9,7 +9,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.closure import ROOT
+from tests.models import model_folder
 
 UV = f"""#!/bin/sh
 mkdir -p .venv/bin
@@ -45,3 +48,53 @@ def test_a_clone_has_the_bytes_that_hashes_are_of_whatever_git_is_told(tmp_path:
     own = "git init -q && git add . && git -c user.name=a -c user.email=a@b commit -qm a"
     subprocess.run(f"{own} && git clone -qc core.autocrlf=true . b", shell=True, check=True, cwd=tmp_path)
     assert (tmp_path / "b/a.json").read_bytes() == b"one\ntwo\n"
+
+
+HIDDEN = """
+import sys
+from importlib.machinery import PathFinder
+from pipeline.running.errors import EXTRAS
+
+class Shown(PathFinder):
+    @classmethod
+    def find_spec(cls, name, *where):
+        return None if name.partition(".")[0] in EXTRAS else super().find_spec(name, *where)
+
+sys.meta_path[sys.meta_path.index(PathFinder)] = Shown
+"""
+USED = """
+from pathlib import Path
+from pipeline import Octopi
+from pipeline.use.adapt import adapt
+
+model = Octopi.from_pretrained()
+videos = [f"{sys.argv[1]}/{name}.mp4" for name in ("soft", "hard")]
+said = model.describe(videos[0])
+assert said.levels["hardness"] == "soft" and "soft" in said.sentence
+assert "softer" in model.ask("Which is softer?", videos)
+adapt(model, videos, Path("adapted"))
+model.remember("mug", videos[0], "touches")
+assert model.recognise(videos[0], "touches").objects[0].name == "mug"
+"""
+
+
+@pytest.mark.slow
+def test_the_core_answers_without_the_extras(tmp_path: Path) -> None:
+    (tmp_path / "octopi").mkdir()
+    (tmp_path / "octopi" / "smollm2").symlink_to(model_folder("smollm2"))
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)}
+    command = [sys.executable, "-c", HIDDEN + USED, str(ROOT / "examples")]
+    subprocess.run(command, cwd=tmp_path, env=environment, check=True)
+
+
+COMMANDS = {"serve": "serve", "demo": "serve", "repro": "train", "scale smoke": "train", "diff HEAD": "train"}
+
+
+@pytest.mark.parametrize(("command", "extra"), COMMANDS.items())
+def test_a_command_names_the_extra_that_it_takes(command: str, extra: str) -> None:
+    code = f"{HIDDEN}from pipeline.cli import main\nmain()"
+    done = subprocess.run(
+        [sys.executable, "-c", code, *command.split()], cwd=ROOT, text=True, capture_output=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1), done.stderr
+    assert f"octopi-pipeline[{extra}]" in done.stderr

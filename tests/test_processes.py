@@ -16,6 +16,7 @@ import pytest
 import yaml
 
 from pipeline.core.io import atomic_folder
+from pipeline.core.runtime import cores
 from pipeline.running.stage import stage
 from pipeline.scales import compose, write_params
 from tests.closure import ROOT
@@ -71,10 +72,9 @@ def interrupted(folder: Path, *command: str) -> tuple[int, list[str]]:
 
 @pytest.mark.parametrize("body", [IMPORTING, RUNNING])
 def test_ctrl_c_in_a_chain_is_one_line_and_what_is_finished_stays(here: Path, body: str) -> None:
-    (here / "dvc.yaml").write_text(CHAIN)
+    repository(here, CHAIN)
     (here / "stages").mkdir()
     (here / "stages/slow.py").write_text(f"import time\n{body}\n")
-    subprocess.run(f"git init -q && '{sys.executable}' -m dvc init -q", shell=True, check=True)
     assert interrupted(here, "octopi", "repro") == (130, [STOPPED])
     assert (here / "first.txt").exists()
     assert list(yaml.safe_load((here / "dvc.lock").read_text())["stages"]) == ["first"]
@@ -83,11 +83,93 @@ def test_ctrl_c_in_a_chain_is_one_line_and_what_is_finished_stays(here: Path, bo
     assert [line.split(":")[0] for line in lines[1:]] == ["ERROR"], "DVC's own"
 
 
+BRANCHES = """\
+stages:
+  first: {cmd: touch first, outs: [first]}
+  align:
+    matrix: {v: [a, b]}
+    cmd: echo >> begun; touch ${item.v}; for i in $(seq 60); do [ -e a -a -e b ] && exit; sleep 1; done; exit 1
+    deps: [first]
+    outs: ['${item.v}']
+  answer: {matrix: {v: [a, b]}, cmd: "cp ${item.v} ${item.v}2", deps: ["${item.v}"], outs: ["${item.v}2"]}
+  last: {cmd: cat a2 b2 > last, deps: [a2, b2], outs: [last]}
+"""
+BROKEN = """\
+stages:
+  good: {cmd: "while [ ! -e failed ]; do sleep .1; done; touch good", outs: [good]}
+  bad: {cmd: "touch bad; echo >> failed; echo bad: why; exit 3", outs: [bad]}
+  last: {cmd: touch last, deps: [good, bad], outs: [last]}
+"""
+
+
+def repository(folder: Path, chain: str) -> None:
+    (folder / "dvc.yaml").write_text(chain)
+    subprocess.run(f"git init -q && '{sys.executable}' -m dvc init -q", shell=True, check=True, cwd=folder)
+
+
+@pytest.mark.skipif(cores() < 2, reason="needs two cores")
+def test_variants_run_side_by_side_and_all_is_in_the_lock(here: Path) -> None:
+    """Each `align` waits for the other one: of DVC alone it would fail."""
+    repository(here, BRANCHES)
+    subprocess.run(["octopi", "repro"], env=ENVIRONMENT, check=True)
+    locked = yaml.safe_load((here / "dvc.lock").read_text())["stages"]
+    assert (here / "begun").read_text() == "\n\n", "once each"
+    assert set(locked) == {"first", "align@a", "align@b", "answer@a", "answer@b", "last"}
+    assert "up to date" in subprocess.check_output(["dvc", "status"], text=True, env=ENVIRONMENT)
+
+
+@pytest.mark.skipif(cores() < 2, reason="needs two cores")
+def test_a_stage_that_fails_runs_once_and_what_ran_beside_it_is_kept(here: Path) -> None:
+    repository(here, BROKEN)
+    ended = subprocess.run(["octopi", "repro"], env=ENVIRONMENT, text=True, capture_output=True, check=False)
+    assert (ended.returncode, ended.stdout.splitlines()[-1], ended.stderr) == (255, "bad: why", "")
+    assert (here / "failed").read_text() == "\n"
+    assert list(yaml.safe_load((here / "dvc.lock").read_text())["stages"]) == ["good"]
+
+
+@pytest.mark.skipif(cores() < 2, reason="needs two cores")
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_a_killed_chain_leaves_no_process_of_dvcs_and_goes_on(here: Path, number: signal.Signals) -> None:
+    """As DVC, it leaves the stage, which may be at its end."""
+    repository(here, CHAIN)
+    (here / "stages").mkdir()
+    (here / "stages/slow.py").write_text(f"import time\n{RUNNING}\n")
+    process = launch(here, "octopi", "repro", errors=subprocess.DEVNULL)
+    assert process.stdout
+    while process.stdout.readline() != "now\n":
+        pass
+    children = psutil.Process(process.pid).children(recursive=True)
+    living = [child for child in children if child.status() != psutil.STATUS_ZOMBIE]
+    stage = [child for child in living if "stages/slow.py" in child.cmdline()[-1]]
+    process.send_signal(number)
+    process.wait()
+    wait_until_ended(set(living) - set(stage))
+    (here / "stages/slow.py").write_text("")
+    subprocess.run(["octopi", "repro"], env=ENVIRONMENT, check=True)
+    for left in stage:
+        left.kill()
+
+
 @pytest.mark.parametrize("body", [SLEEPING, TELLING])
 def test_ctrl_c_ends_the_processes_of_a_stage(tmp_path: Path, body: str) -> None:
     (tmp_path / "stages").mkdir()
     (tmp_path / "stages/slow.py").write_text(f"import time\n{body}\n")
     assert interrupted(tmp_path, sys.executable, "stages/slow.py") == (130, [STOPPED])
+
+
+@pytest.mark.parametrize(("end", "status"), [("", 0), ("raise UserError('no')", 1), ("1 / 0", 1), ("sys.exit(3)", 3)])
+def test_a_stage_ends_at_once_where_it_ended_well(here: Path, end: str, status: int) -> None:
+    """What libraries do at the end is done, what was printed is shown, and another end keeps its status."""
+    code = "import atexit, sys\nfrom pipeline.running.errors import UserError\n"
+    code += "from pipeline.running.stage import stage\nclass Late:\n    def __del__(self): print('apart')\n"
+    code += "late = Late()\natexit.register(print, 'library')\n"
+    (here / "stages").mkdir()
+    (here / "stages/slow.py").write_text(f"{code}with stage('slow'):\n    print('body')\n    {end}\n")
+    command = [sys.executable, "stages/slow.py"]
+    done = subprocess.run(command, env=ENVIRONMENT, text=True, capture_output=True, check=False)
+    assert done.returncode == status, done.stderr
+    said = [line for line in done.stdout.splitlines() if not line.startswith("slow: ")]
+    assert said == ["body", "library", *(["apart"] if status else [])]
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])

@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+import csv
 import logging
+import os
+import signal
+from collections.abc import Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from graphlib import TopologicalSorter
+from multiprocessing import get_context
 from pathlib import Path
 from shutil import which
 from subprocess import run
 
 from pipeline.config.params import CHAIN, load_params
+from pipeline.core.runtime import cores
 from pipeline.running.errors import UserError
+from pipeline.running.parallel import end_with_parent
+from pipeline.scales.cost import HOURS
+from pipeline.tasks import TASKS
 
 INTERRUPTED = ("exited with 130", "exited with -2")
 """How DVC's error ends for a stage that Ctrl-C ended, the second where it had hardly begun or was at its end."""
 
 
-def outdated(root: Path) -> tuple[list[str], int, bool]:
-    """The stages that will run at the most, in their order, how many there are, and whether all outputs are there.
+def outdated(root: Path) -> tuple[dict[str, list[str]], int, bool]:
+    """The stages that will run at the most, each with those it waits for; how many stages there are; if outputs are.
 
     A stage runs where its inputs changed, and every stage after it unless its own inputs come out the same.
 
@@ -37,9 +48,64 @@ def outdated(root: Path) -> tuple[list[str], int, bool]:
         raise UserError(f"{' '.join(str(error).split())}; {back if 'dvc.lock' in str(error) else 'mend it'}") from None
     started = [stage for stage in graph if stage.addressing in changed]
     waiting = set(started).union(*(nx.ancestors(graph, stage) for stage in started))
-    order = [stage.addressing for stage in nx.dfs_postorder_nodes(graph) if stage in waiting]
+    waits = {
+        stage.addressing: [before.addressing for before in graph.successors(stage) if before in waiting]
+        for stage in nx.dfs_postorder_nodes(graph)
+        if stage in waiting
+    }
     whole = all(Path(out.fs_path).exists() for stage in graph for out in stage.outs)
-    return order, sum(stage.path_in_repo == str(CHAIN) for stage in graph), whole
+    return waits, sum(stage.path_in_repo == str(CHAIN) for stage in graph), whole
+
+
+def side_by_side(waits: Mapping[str, list[str]], at_once: int) -> int:
+    """Run stages, each behind those it waits for, by several processes of DVC, as one runs one stage at a time.
+
+    Returns:
+        0, or the exit status of a stage that failed, of which it said a line; the others that ran have ended.
+    """
+    order = TopologicalSorter(waits)
+    order.prepare()
+    pool = ProcessPoolExecutor(at_once, get_context("spawn"), _begin, (os.getpid(),))
+    running: dict[Future[int], str] = {}
+    try:
+        while order.is_active():
+            running |= {pool.submit(_reproduce_one, name): name for name in order.get_ready()}
+            for ended in wait(running, return_when=FIRST_COMPLETED).done:
+                if status := ended.result():
+                    return status
+                order.done(running.pop(ended))
+    except KeyboardInterrupt:
+        pool.shutdown(cancel_futures=True)
+        if any(not job.cancelled() and job.result() for job in running):
+            return 130  # The stage that was stopped has said so.
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return 0
+
+
+def _begin(parent: int) -> None:
+    end_with_parent(parent)
+    # Ctrl-C is for the stage, which gets it too; to ignore it here would have the stage ignore it.
+    signal.signal(signal.SIGINT, lambda *_: None)
+
+
+def _reproduce_one(name: str) -> int:
+    """Quiet, as the stage itself says what it does and what goes wrong."""
+    from dvc.cli import main as dvc
+
+    return int(dvc(["--wait-for-lock", "repro", "--quiet", "--single-item", name]))
+
+
+def right_answers(file: Path, model: str | None) -> Iterator[str]:
+    """A line a task of scores.csv: what a trained model that was asked got right; without one, the full system."""
+    whose = (model, "", "touch") if model else ("finetuned", "with", "real")
+    with file.open(newline="", encoding="utf-8") as stream:
+        rows = [r for r in csv.DictReader(stream) if (r["encoder"], r["lora"], r["touch"]) == whose]
+    found = {r["task"]: r for r in rows if r["seed"] == "all" and r["measure"] in ("choice", "combined")}
+    for name in (task for task in TASKS if task in found):
+        right, low, high, chance = (f"{100 * float(found[name][k]):.0f}" for k in ("accuracy", "low", "high", "chance"))
+        yield f"  {TASKS[name].title}: {right} % right [{low}, {high}] of {found[name]['n']}, guessing {chance}"
 
 
 def reproduce(root: Path, arguments: list[str]) -> int:
@@ -59,17 +125,23 @@ def reproduce(root: Path, arguments: list[str]) -> int:
         return not stopped
 
     params = load_params(root / "params.yaml")
-    name, (waiting, total, whole) = params.report_name, outdated(root)
-    if waiting:
-        print(f"{name}: up to {len(waiting)} of {total} stages will run", flush=True)
+    name, (waits, total, whole) = params.report_name, outdated(root)
+    if waits:
+        hours = f" (all: {HOURS[params.scale]} hours)" if params.scale in HOURS else ""
+        print(f"{name}: up to {len(waits)} of {total} stages will run{hours}", flush=True)
     if not whole and arguments == ["--dry"]:
         # DVC's own ends where a stage that is not run now has left nothing for the next one.
-        print("\n".join(waiting))
+        print("\n".join(waits))
         return 0
-    if waiting or arguments:
+    if waits or arguments:
         for handler in logging.getLogger("dvc").handlers:
             handler.addFilter(shown)
-        ended = int(dvc(["repro", *arguments]))
+        # Not on a GPU, nor where torch chooses how many threads a stage takes.
+        runtime, ended = params.runtime, 0
+        places = cores() // runtime.threads if runtime.threads and runtime.device == "cpu" and not arguments else 1
+        if min(places, len(waits)) > 1:
+            ended = side_by_side(waits, places)
+        ended = ended or int(dvc(["repro", *arguments]))
         if stopped and isinstance(stopped[0], KeyboardInterrupt):
             raise KeyboardInterrupt
         if ended:
@@ -79,8 +151,12 @@ def reproduce(root: Path, arguments: list[str]) -> int:
     if not (arguments or params.tracking.uri or (MLRUNS / "mlflow.db").is_file()):
         # A clone has the lock of a chain that ran elsewhere, so that DVC does not publish it; MLflow has nothing yet.
         attempt(params.tracking, publish, params)
+    if (scores := root / "reports" / name / "scores.csv").is_file():
+        model = next(iter(params.evaluate.models), None)
+        print(f"{model or 'The full system'}, with 95 % intervals:", *right_answers(scores, model), sep="\n")
     print(f"Report: reports/{name}/README.md; all reports on one page: reports/index.html")
     print("Dashboard: make dashboard, then open the link to all variants that it prints after ten seconds")
+    print('Ask the shipped model: octopi ask "Which is softer?" examples/soft.mp4 examples/hard.mp4')
     made = ["dvc.lock", "params.yaml", "reports"]
     status = ["git", "status", "--porcelain", *made]
     # A run that gave what is committed leaves nothing to keep; nor is there anything to say without Git.

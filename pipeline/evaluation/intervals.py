@@ -25,7 +25,6 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 from scipy import stats
-from statsmodels.stats.proportion import proportion_confint
 
 Values = npt.NDArray[np.float64]
 Objects = tuple[str, ...]
@@ -154,11 +153,12 @@ def wilson(values: Values, design: Design) -> tuple[Values, Values]:
     """The ends (...) of `accuracy_interval` for many data sets of one design."""
     mean = values.mean(axis=-1)
     n = effective(mean * (1 - mean), variance(values, design), design)
-    # statsmodels takes a normal quantile: this size gives Student's.
-    size = 2 * stats.norm.sf(stats.t.ppf((1 + LEVEL) / 2, design.freedom))
-    low, high = proportion_confint(mean * n, n, alpha=size, method="wilson")
-    # Rounding must not leave the estimate outside.
-    return np.minimum(low, mean), np.maximum(high, mean)
+    # Wilson's, with Student's quantile; statsmodels has a normal one, and is more than using a model takes.
+    square = stats.t.ppf((1 + LEVEL) / 2, design.freedom) ** 2
+    centre = (mean + square / (2 * n)) / (1 + square / n)
+    half = np.sqrt(square * (mean * (1 - mean) / n + square / (4 * n**2))) / (1 + square / n)
+    # Rounding must not leave the estimate outside, nor an end outside of 0 to 1.
+    return np.minimum(np.maximum(centre - half, 0), mean), np.maximum(np.minimum(centre + half, 1), mean)
 
 
 def effective(single: Values, mean: Values, design: Design) -> Values:

@@ -8,6 +8,15 @@ from collections.abc import Iterable
 
 from pydantic import ValidationError
 
+EXTRAS = {
+    **dict.fromkeys(("dvc", "hydra", "matplotlib", "mlflow", "omegaconf", "open_clip", "openai"), "train"),
+    **dict.fromkeys(("pandas", "pyarrow", "sentencepiece", "statsmodels"), "train"),
+    **dict.fromkeys(("fastapi", "starlette", "uvicorn"), "serve"),
+    "rosbags": "robot",
+    "ray": "ray",
+}
+"""By module, the extra of pyproject.toml that installs it; the core goes without."""
+
 
 class UserError(Exception):
     """Bad input: one line that names the file or key and how to mend it.

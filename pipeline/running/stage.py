@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import errno
 import hashlib
 import json
@@ -31,12 +32,23 @@ from pipeline.core.io import code_of, remove_rests, sha256, write_json, write_te
 from pipeline.core.layout import CHECKPOINTS, DATA, MODELS, REPORTS, RUNS, embeddings_dir
 from pipeline.core.records import Measurement
 from pipeline.core.runtime import cores, limit_threads, processor, use_kernels
-from pipeline.running.errors import UserError
+from pipeline.running.errors import EXTRAS, UserError
 from pipeline.running.parallel import end_with_parent, use_backend
 from pipeline.running.progress import quiet_libraries
 
 TF32_VARIABLES = ("NVIDIA_TF32_OVERRIDE", "TORCH_ALLOW_TF32_CUBLAS_OVERRIDE")
 """Variables that turn TF32, which has float16's precision, on or off. They change results; some containers set them."""
+
+_ended_well = False
+
+
+@atexit.register  # Before other libraries are loaded, so that it comes behind all that they have to do at the end.
+def _leave() -> None:
+    """End a stage's process that ended well at once: Python would take a million objects apart, for two seconds."""
+    if _ended_well and Path(sys.argv[0]).absolute().parent.name == "stages":
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(0)
 
 
 @dataclass
@@ -114,6 +126,7 @@ def stage(name: str, key: str | None = None, *, launched: bool = False, of_varia
     from. Metrics, time and memory go to runs/, where tracking reads them. No stage depends on that, so results stay
     identical from run to run.
     """
+    global _ended_well
     started = time.time()
     full = f"{name}@{key}" if key else name
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
@@ -154,6 +167,7 @@ def stage(name: str, key: str | None = None, *, launched: bool = False, of_varia
             shutil.rmtree(CHECKPOINTS / full, ignore_errors=True)
             said = ", ".join(f"{k} {v:g}" for k, v in list(running.metrics.items())[:4])
             print(f"{full}: done in {time.time() - started:.1f} s{': ' if said else ''}{said}", flush=True)
+        _ended_well = True
     except Exception as error:
         if (line := one_line(error)) is None:
             raise
@@ -171,10 +185,12 @@ NO_MEMORY = ("out of memory", "can't allocate memory", "CUBLAS_STATUS_ALLOC_FAIL
 
 
 def one_line(error: Exception) -> str | None:
-    """What a person is told of bad input, or of what the operating system refused; None for any other error."""
+    """What a person is told of bad input, of a missing extra, or of what the operating system refused; else None."""
     said = str(error)
     if isinstance(error, UserError):
         return said
+    if isinstance(error, ModuleNotFoundError) and (extra := EXTRAS.get(str(error.name).partition(".")[0])):
+        return f"{error.name} is not installed, which this takes; run pip install 'octopi-pipeline[{extra}]'"
     if isinstance(error, MemoryError) or any(words in said for words in NO_MEMORY):
         return "out of memory; lower the batch sizes in params.yaml"
     number = error.errno if isinstance(error, OSError) else None

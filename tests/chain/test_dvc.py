@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import FunctionType
@@ -71,6 +74,21 @@ def test_dependencies_cover_what_a_stage_can_import(name: str) -> None:
     assert not missing, f"add to the dependencies of {name} in dvc.yaml"
     idle = [d for d in code(name) if d in told or not any(m == d or m.startswith(f"{d}/") for m in reached)]
     assert not idle, f"{name} has no use for these dependencies"
+
+
+HEAVY = {"dvc", "fastapi", "hydra", "matplotlib", "mlflow", "pandas", "statsmodels", "torch", "transformers"}
+CHEAP = ("weights", "invent", "synthesize", "extract_frames", "split", "audit", "questions", "grade")
+
+
+@pytest.mark.parametrize("name", CHEAP)
+def test_a_stage_loads_nothing_that_it_has_no_use_for(name: str) -> None:
+    """Which takes seconds, and thirty processes of a chain start."""
+    tree = ast.walk(ast.parse((ROOT / "stages" / f"{name}.py").read_text()))
+    code = [ast.unparse(node) for node in tree if isinstance(node, ast.Import | ast.ImportFrom)]
+    code += ["import sys", "print(*{name.partition('.')[0] for name in sys.modules})"]
+    code.sort(key=lambda line: "__future__" not in line)
+    loaded = subprocess.check_output([sys.executable, "-c", "\n".join(code)], text=True, cwd=ROOT).split()
+    assert not HEAVY & {*loaded}
 
 
 def test_the_layout_is_that_of_the_outputs() -> None:

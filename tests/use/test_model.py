@@ -16,6 +16,7 @@ from pipeline.encoder.timm_backbone import STAGES
 from pipeline.use import encoding
 from pipeline.use import model as model_code
 from pipeline.use.encoding import Classified, VideoEncoder
+from pipeline.use.evaluate import use_onednn
 from pipeline.use.frames import read_touch
 from pipeline.use.memory import TOUCHES
 from pipeline.use.model import Octopi
@@ -34,6 +35,14 @@ def answers_as_stored(model: Octopi, made: Made) -> int:
 
 def test_its_answers_equal_the_stored_predictions(made: Made, octopi: Octopi) -> None:
     assert answers_as_stored(octopi, made) >= 25
+
+
+def test_onednn_gives_the_same_answers(made: Made) -> None:
+    model = Octopi.from_pretrained(made.folder, device="cpu")
+    use_onednn(model.llm)
+    names = [name for name, _ in model.llm.llm.named_parameters()]
+    assert not [name for name in names if "lora_" in name or "q_proj" in name], "they are oneDNN's buffers now"
+    assert answers_as_stored(model, made) >= 25
 
 
 @pytest.mark.slow
