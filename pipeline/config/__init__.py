@@ -259,10 +259,10 @@ class LanguageConfig(Section):
     """Folder in transformers' format with a Llama-like model (safetensors) and a fast tokenizer. The chain makes what
     is named below data/weights/."""
     start: str = ""
-    """Folder of a trained model, such as models/finetuned-with-all-0, whose connector and adapter to start from; empty:
-    new ones. Encoder, language model and adapter must have its settings; it must not have met a test object. DVC tracks
-    the model that is shipped, and of another folder only the name: `dvc repro --force align@...` trains on from what it
-    holds by now."""
+    """Folder of a trained model, such as models/finetuned-with-all-0, whose connector and adapter to start from, and
+    whose backbone `scenes` to take where `pretrain` has its defaults; empty: new ones. Encoder, language model and
+    adapter must have its settings; it must not have met a test object. DVC tracks the model that is shipped, and of
+    another folder only the name: `dvc repro --force align@...` trains on from what it holds by now."""
     dtype: DtypeName = "float32"
     """Number format of the frozen weights; whatever is trained stays in float32. `auto`: bfloat16 where the device
     computes it in hardware, else float32."""

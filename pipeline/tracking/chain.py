@@ -17,7 +17,7 @@ from pipeline.config.params import CHAIN, PARAMS_FILE
 from pipeline.core.io import check_made, read_json, read_table
 from pipeline.core.layout import GRADED, REPORTS, RUNS
 from pipeline.core.records import TouchInput, Variant
-from pipeline.evaluation.records import Graded
+from pipeline.evaluation.records import Graded, Shown
 from pipeline.running.errors import UserError
 from pipeline.tasks import TASKS
 
@@ -100,14 +100,27 @@ def accuracies(params: Params) -> dict[str, dict[str, float]]:
     found: dict[str, dict[str, float]] = {}
     for row in rows:
         if row["lora"] and row["seed"].isdigit():
-            whole = TASKS[row["task"]].measure if row["task"] in TASKS else "choice"
-            task = row["task"] if row["measure"] == whole else f"{row['task']}.{row['measure']}"
-            cells = {task: row["accuracy"], f"low/{task}": row["low"], f"high/{task}": row["high"]}
-            if row["touch"] != TouchInput.REAL:
-                cells = {f"{row['touch']}/{task}": row["accuracy"]}
-            metrics = found.setdefault("-".join(row[axis] for axis in Variant._fields), {})
-            metrics |= {name: round(float(cell), 4) for name, cell in cells.items() if cell not in ("", None)}
+            found.setdefault("-".join(row[axis] for axis in Variant._fields), {}).update(_metrics(row))
     return found
+
+
+def reported(table: Path) -> dict[tuple[str, ...], dict[str, float]]:
+    """Metrics of what answered by touch in a report's scores.csv, seeds and folds pooled, by its factors."""
+    found: dict[tuple[str, ...], dict[str, float]] = {}
+    for row in csv.DictReader(table.read_text(encoding="utf-8").splitlines()):
+        model = row["touch"] == Shown.TOUCH  # One that `evaluate` asked; what has no LoRA otherwise are the heads.
+        if row["seed"] == "all" and (model or row["lora"]):
+            found.setdefault(tuple(row[axis] for axis in Variant._fields), {}).update(_metrics(row))
+    return found
+
+
+def _metrics(row: Mapping[str, Any]) -> dict[str, float]:
+    whole = TASKS[row["task"]].measure if row["task"] in TASKS else "choice"
+    task = row["task"] if row["measure"] == whole else f"{row['task']}.{row['measure']}"
+    cells = {task: row["accuracy"], f"low/{task}": row["low"], f"high/{task}": row["high"]}
+    if row["touch"] not in (TouchInput.REAL, Shown.TOUCH):
+        cells = {f"{row['touch']}/{task}": row["accuracy"]}
+    return {name: round(float(cell), 4) for name, cell in cells.items() if cell not in ("", None)}
 
 
 def flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:

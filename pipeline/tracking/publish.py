@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from pipeline.config import Params
 from pipeline.config.params import load_params
 from pipeline.core.io import read_json, read_table
@@ -18,11 +20,26 @@ from pipeline.core.layout import HISTORY_FILE, MODELS, REPORTS, answers_dir, enc
 from pipeline.core.records import Encoder, Lora, Measurement, Variant
 from pipeline.running.errors import UserError
 from pipeline.tasks import TASKS
-from pipeline.tracking.chain import CHAIN_LOCK, ChainStage, accuracies, axes, digest, flatten, read_stages, settings
+from pipeline.tracking.chain import (
+    CHAIN_LOCK,
+    ChainStage,
+    accuracies,
+    axes,
+    digest,
+    flatten,
+    read_stages,
+    reported,
+    settings,
+)  # fmt: skip
 from pipeline.tracking.store import KIND, LOCK, PARENT, STAGE, Store, TrackingError, cause, out_of_reach
+from pipeline.weights import is_random
 
-VARIANT, CONTENT, STATE = "octopi.variant", "octopi.content", "octopi.state"
+VARIANT, REPORT = "octopi.variant", "octopi.report"
+"""Tags that name a variant of this folder's chain, or the report that has it, which another chain made."""
+CONTENT, STATE = "octopi.content", "octopi.state"
 """Tags with what a finished variant and reproduction were made from; written last."""
+PLUMBING = " (a test of the plumbing)"
+"""Behind the name of a variant whose base models are random, so that all its accuracies are chance."""
 TABLE = "#/experiments/{}/runs?viewStateShareKey=variants"
 """Where a server has an experiment's table of variants."""
 MOST_COLUMNS = 8
@@ -68,6 +85,7 @@ def _publish(store: Store, params: Params, stages: Mapping[str, ChainStage]) -> 
     for title, ran in fresh.items():
         _complete(store, params, parent, title, stages[title], *ran)
     ended = [run.info.end_time for run in store.find({KIND: "stage", PARENT: parent}) if LOCK in run.data.tags]
+    _committed(store, params, now)
     new, links = _variants(store, params, parent, stages)
     report = REPORTS / params.report_name
     if report.is_dir():
@@ -125,10 +143,9 @@ def _variants(
         begin, end = stage.ran or (int(time.time() * 1000),) * 2
         factors = {axis: str(value) for axis, value in variant._asdict().items()}
         tags = {VARIANT: variant.key, PARENT: parent}
-        run = store.create(variant.key, "variant", begin, settings(params, factors), tags)
-        # Whole tasks before their parts, as the dashboard keeps the order.
-        ordered = sorted(metrics.items(), key=lambda metric: ("." in metric[0], metric[0]))
-        store.log(run, [(name, value, end, 0) for name, value in ordered])
+        name = variant.key + PLUMBING * (is_random(params.language.weights) or is_random(params.encoder.weights))
+        run = store.create(name, "variant", begin, settings(params, factors), tags)
+        store.log(run, [(name, value, end, 0) for name, value in _ordered(metrics)])
         made = {"predictions": answers_dir(variant), "model": trained_dir(variant)}
         if variant.lora is not Lora.WITHOUT:
             made["alignment"] = trained_dir(variant._replace(lora=Lora.WITHOUT))
@@ -144,6 +161,30 @@ def _variants(
     return new, links
 
 
+def _committed(store: Store, params: Params, now: int) -> None:
+    """Finished runs of the reports in reports/ that another chain made, one a system: so a clone's table has them."""
+    for table in sorted(REPORTS.glob("*/scores.csv")):
+        report, content = table.parent, digest(table.read_text(encoding="utf-8"))
+        if report.name == params.report_name or store.find({REPORT: report.name, CONTENT: content}):
+            continue
+        own = yaml.safe_load((report / "params.yaml").read_text(encoding="utf-8"))
+        for values, metrics in reported(table).items():
+            factors = dict(zip(Variant._fields, values, strict=True))
+            # A model that `evaluate` asked has no factors.
+            name = f"{report.name}: {'-'.join(values[:3] if factors['lora'] else values[:1])}"
+            run = store.create(name, "variant", now, {**dict(flatten(own)), **factors}, {REPORT: report.name})
+            store.log(run, [(name, value, now, 0) for name, value in _ordered(metrics)])
+            for file in ("README.md", "provenance.json", "effects.csv"):
+                if (report / file).is_file():
+                    store.client.log_artifact(run, str(report / file), "report")
+            store.finish(run, now, {CONTENT: content})
+
+
+def _ordered(metrics: Mapping[str, float]) -> list[tuple[str, float]]:
+    """Whole tasks before their parts, as the dashboard keeps the order."""
+    return sorted(metrics.items(), key=lambda metric: ("." in metric[0], metric[0]))
+
+
 def _front_page(experiment: str, runs: Sequence[Any]) -> dict[str, str]:
     """The experiment's description, and the table of variants that it leads to, written as MLflow's *Share view* does:
     only so do parameters and metrics become columns without a click each."""
@@ -151,7 +192,8 @@ def _front_page(experiment: str, runs: Sequence[Any]) -> dict[str, str]:
 
     every = {name for run in runs for name in run.data.metrics}
     tasks = [*(t for t in TASKS if t in every), *sorted(n for n in every - {*TASKS} if not set("/.") & {*n})]
-    values = pd.DataFrame([run.data.params for run in runs]).drop(columns=list(Variant._fields), errors="ignore")
+    here = [run.data.params for run in runs if REPORT not in run.data.tags]
+    values = pd.DataFrame(here).drop(columns=list(Variant._fields), errors="ignore")
     counts = values.nunique().sort_index().sort_values(ascending=False, kind="stable")
     differ = counts[counts > 1].index[:MOST_COLUMNS]
     accuracy = [f"metrics.`{task}`" for task in tasks]
@@ -165,7 +207,7 @@ def _front_page(experiment: str, runs: Sequence[Any]) -> dict[str, str]:
         "selectedColumns": [*accuracy, *factors],
         "searchFilter": f"tags.`{KIND}` = 'variant'",
         # Sorted by time, the table would fold variants below their reproductions.
-        "orderByKey": factors[-len(Variant._fields)],
+        "orderByKey": [*accuracy, *factors][0],
         "orderByAsc": False,
         "startTime": "ALL",
         "lifecycleFilter": "Active",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
+import runpy
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -18,17 +19,22 @@ from scipy.special import expit
 
 import pipeline.running.parallel
 from pipeline.config import FramesConfig, PretrainConfig
+from pipeline.core.io import read_table
+from pipeline.core.layout import HISTORY_FILE, PRETRAINED, SHIPPED
+from pipeline.core.records import Measurement
 from pipeline.core.runtime import seed_everything
 from pipeline.encoder import synthetic as module
 from pipeline.encoder.pretrain import STRENGTH, PretrainingDataset, PretrainingModel, vary
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.encoder.synthetic import HEIGHT, KINDS, PITCH, SIDE, WIDTH, SyntheticPictures, draw_object, draw_pictures
 from pipeline.running.errors import UserError
+from pipeline.scales import compose, write_params
 from pipeline.scenes.geometry import heights
 from pipeline.scenes.invent import MODULUS_MPA, invent
 from pipeline.scenes.measure import bump_share, texture
 from pipeline.scenes.recipe import SceneRecipe
 from pipeline.videos.frames.subtraction import subtract
+from tests.closure import ROOT
 from tests.frame_rules import pillow
 
 CONFIG = PretrainConfig(objects=9, presses=2, seed=5)
@@ -252,3 +258,19 @@ def test_the_loss_weighs_standardised_quantities_and_kinds() -> None:
     assert found["quantities"] == pytest.approx(huber, rel=1e-5)
     assert found["kinds"] == pytest.approx(flags, rel=1e-5)
     assert found["loss"] == pytest.approx(2 * huber + 0.6 * flags, rel=1e-5)
+
+
+def test_a_run_that_starts_from_a_model_takes_its_backbone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    params = compose("finetune", [f"language.start={SHIPPED}"], conf=ROOT / "conf")
+    write_params(params)
+    script = str(ROOT / "stages" / "pretrain.py")
+    made_before = runpy.run_path(script, run_name="__main__")["made_before"]
+    theirs = SHIPPED / "encoder" / "scenes.safetensors"
+    assert PRETRAINED.read_bytes() == theirs.read_bytes()
+    assert not read_table(PRETRAINED.with_name(HISTORY_FILE), Measurement)
+    assert made_before(params) == theirs
+    from_it = f"language.start={SHIPPED}"
+    others = [(from_it, other) for other in ("pretrain.steps=899", "frames.pixels=96", "frames.fit=crop")]
+    for other in (*others, ["language.start=models/other"], ["language.start=''"]):
+        assert made_before(compose("finetune", other, conf=ROOT / "conf")) is None, other

@@ -17,7 +17,7 @@ from pipeline.config import Params, TrackingConfig
 from pipeline.core.io import write_json, write_table
 from pipeline.core.records import Measurement
 from pipeline.scales import compose, write_params
-from pipeline.tracking.publish import publish
+from pipeline.tracking.publish import PLUMBING, publish
 from pipeline.tracking.store import Store, out_of_reach
 from tests.closure import ROOT
 
@@ -170,10 +170,10 @@ def runs(kind: str = "", uri: str = "") -> list[Run]:
 
 
 def by_name(kind: str) -> dict[str, Any]:
-    """Runs of a kind by their names; fails where two have one name."""
+    """Runs of a kind by their names, without what is said of random models; fails where two have one name."""
     found = runs(kind)
     assert len({run.info.run_name for run in found}) == len(found)
-    return {run.info.run_name: run for run in found}
+    return {run.info.run_name.removesuffix(PLUMBING): run for run in found}
 
 
 def losses(run: Run) -> list[Metric]:

@@ -19,7 +19,7 @@ from pipeline.core.io import write_table
 from pipeline.evaluation.records import Graded
 from pipeline.scales import write_params
 from pipeline.tracking.chain import accuracies, read_stages
-from pipeline.tracking.publish import publish
+from pipeline.tracking.publish import PLUMBING, publish
 from pipeline.tracking.store import TrackingError
 from tests.closure import ROOT
 from tests.conftest import refused
@@ -29,6 +29,7 @@ from tests.tracking.conftest import (
     CHAIN,
     FIRST,
     FULL,
+    HEADER,
     SCORES,
     SECONDS,
     TITLES,
@@ -96,7 +97,7 @@ def test_a_new_task_is_a_column_by_itself(again: FakeChain) -> None:
     # Of the parameters only the factors differ.
     assert view["selectedColumns"] == [*tasks, *(f"params.`{a}`" for a in ("encoder", "lora", "opd", "seed"))]
     found = client().search_runs([experiment.experiment_id], view["searchFilter"])
-    assert {run.info.run_name for run in found} == {FULL, BASE}
+    assert {run.info.run_name.removesuffix(PLUMBING) for run in found} == {FULL, BASE}
     assert "viewStateShareKey=variants" in experiment.tags["mlflow.note.content"]
 
 
@@ -136,7 +137,7 @@ def test_only_what_is_new_makes_runs(again: FakeChain, anew: list[str], scores: 
     publish(again.params)
     parent = runs("reproduction")[1]
     children = [run for run in runs() if run.data.tags.get("mlflow.parentRunId") == parent.info.run_id]
-    assert {run.info.run_name for run in children} == {*anew, variant}
+    assert {run.info.run_name.removesuffix(PLUMBING) for run in children} == {*anew, variant}
     assert seconds(parent) == len(anew) * (SECONDS + 1) - 1
     assert parent.data.tags[f"variant.{other}"] == variants[other].info.run_id
     assert f"variant.{variant}" not in parent.data.tags
@@ -153,6 +154,33 @@ def test_going_back_to_results_that_stand_there_adds_nothing(again: FakeChain) -
     again.ran(["grade"], minutes=120, mark="3")
     publish(again.params)
     assert len(runs()) == count + 2
+
+
+def test_reports_of_other_chains_are_finished_runs_above_a_test_of_the_plumbing(chain: FakeChain) -> None:
+    """As a clone has them: scores, parameters of an older version, where the models came from."""
+    other = Path("reports/real-videos")
+    other.mkdir()
+    (other / "params.yaml").write_text("scale: small\nframes: {old: 3}\n")
+    (other / "provenance.json").write_text("{}")
+    shipped = "PC,choice,octopi-small,,all,touch,all,40,30,0,0.75,0.6,0.85,0.3\n"
+    unlike = shipped.replace("touch", "classes") + "heads,combined,finetuned,,,real,all,12,6,0,0.9,0.8,1,0.1\n"
+    (other / "scores.csv").write_text(HEADER + SCORES + shipped + unlike)
+    publish(chain.params)
+    found = {run.info.run_name: run for run in runs("variant")}
+    mine, full = {f"{name}{PLUMBING}" for name in (FULL, BASE)}, found["real-videos: finetuned-with-all"]
+    assert set(found) - mine == {"real-videos: finetuned-with-all", "real-videos: octopi-small"}
+    assert full.data.metrics == {"PC": 0.6, "low/PC": 0.3, "high/PC": 0.8}, "folds and seeds pooled"
+    assert full.data.params == {"encoder": "finetuned", "lora": "with", "opd": "all", "seed": "all"} | {
+        "scale": "small", "frames.old": "3"
+    }  # fmt: skip
+    assert found["real-videos: octopi-small"].data.metrics["PC"] == 0.75
+    assert {run.info.status for run in found.values()} == {"FINISHED"}
+    assert {a.path for a in client().list_artifacts(full.info.run_id, "report")} == {"report/provenance.json"}
+    view = client().get_experiment_by_name("octopi").tags["mlflow.sharedViewState.variants"]
+    assert json.loads(view)["orderByKey"] == "metrics.`OPD`", "random models, whose accuracies are chance, below"
+    chain.ran(["grade"], minutes=60, mark="2")
+    publish(chain.params)
+    assert len(runs("variant")) == len(found)
 
 
 def test_a_clone_that_only_pulled_has_no_stage_runs(chain: FakeChain) -> None:
@@ -229,7 +257,7 @@ def test_the_command_says_what_was_added_or_in_one_line_why_it_could_not(chain: 
 
 PUBLISH = """\
 from pipeline.running.stage import stage
-from pipeline.tracking.publish import publish
+from pipeline.tracking.publish import PLUMBING, publish
 with stage("publish") as run:
     print(publish(run.params))
 """
