@@ -127,7 +127,7 @@ def reproduce(root: Path, arguments: list[str]) -> int:
     params = load_params(root / "params.yaml")
     name, (waits, total, whole) = params.report_name, outdated(root)
     if waits:
-        hours = f" (all: {HOURS[params.scale]} hours)" if params.scale in HOURS else ""
+        hours = f" (hours of a whole run: {HOURS[params.scale]})" if params.scale in HOURS else ""
         print(f"{name}: up to {len(waits)} of {total} stages will run{hours}", flush=True)
     if not whole and arguments == ["--dry"]:
         # DVC's own ends where a stage that is not run now has left nothing for the next one.

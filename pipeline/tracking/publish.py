@@ -40,17 +40,17 @@ CONTENT, STATE = "octopi.content", "octopi.state"
 """Tags with what a finished variant and reproduction were made from; written last."""
 PLUMBING = " (a test of the plumbing)"
 """Behind the name of a variant whose base models are random, so that all its accuracies are chance."""
-TABLE = "#/experiments/{}/runs?viewStateShareKey=variants"
-"""Where a server has an experiment's table of variants."""
+TABLE = "#/experiments/{}/runs?viewStateShareKey={}"
+"""Where a server has an experiment's table of variants or stages."""
 MOST_COLUMNS = 8
 """Changed parameters that the table of variants shows."""
-NOTE, VIEW = "mlflow.note.content", "mlflow.sharedViewState.variants"
+NOTE, VIEW = "mlflow.note.content", "mlflow.sharedViewState.{}"
 
 
 def table_address(port: int) -> str:
     """Where `make dashboard` shows the table of all variants of the folder's own database."""
     here = load_params().tracking.model_copy(update={"uri": ""})
-    return f"http://127.0.0.1:{port}/{TABLE.format(Store(here).experiment)}"
+    return f"http://127.0.0.1:{port}/{TABLE.format(Store(here).experiment, 'variants')}"
 
 
 def publish(params: Params) -> str:
@@ -186,8 +186,7 @@ def _ordered(metrics: Mapping[str, float]) -> list[tuple[str, float]]:
 
 
 def _front_page(experiment: str, runs: Sequence[Any]) -> dict[str, str]:
-    """The experiment's description, and the table of variants that it leads to, written as MLflow's *Share view* does:
-    only so do parameters and metrics become columns without a click each."""
+    """The experiment's description, and the tables of variants and stages that it leads to."""
     import pandas as pd
 
     every = {name for run in runs for name in run.data.metrics}
@@ -195,19 +194,31 @@ def _front_page(experiment: str, runs: Sequence[Any]) -> dict[str, str]:
     here = [run.data.params for run in runs if REPORT not in run.data.tags]
     values = pd.DataFrame(here).drop(columns=list(Variant._fields), errors="ignore")
     counts = values.nunique().sort_index().sort_values(ascending=False, kind="stable")
-    differ = counts[counts > 1].index[:MOST_COLUMNS]
-    accuracy = [f"metrics.`{task}`" for task in tasks]
     # The factors last: a run's name has them.
-    factors = [f"params.`{axis}`" for axis in (*differ, *Variant._fields)]
-    name = "attributes.`Run Name`"
-    view: dict[str, object] = {
-        "columnOrder": [name, *accuracy, *factors],
+    factors = [*counts[counts > 1].index[:MOST_COLUMNS], *Variant._fields]
+    costs = ["system/seconds", "system/peak_memory_mb"]
+    return {
+        NOTE: f"[All variants with their accuracies]({TABLE.format(experiment, 'variants')}) · "
+        f"[seconds and memory of each stage]({TABLE.format(experiment, 'stages')}) · docs/dashboard.md",
         # A laptop's 1,440 pixels show the name, five accuracies and what differs.
-        "columnWidths": {name: 190, **dict.fromkeys(accuracy, 65), **dict.fromkeys(factors, 110)},
-        "selectedColumns": [*accuracy, *factors],
-        "searchFilter": f"tags.`{KIND}` = 'variant'",
-        # Sorted by time, the table would fold variants below their reproductions.
-        "orderByKey": [*accuracy, *factors][0],
+        VIEW.format("variants"): _table("variant", tasks, factors, 65),
+        VIEW.format("stages"): _table("stage", costs, [], 190),
+    }
+
+
+def _table(kind: str, measured: Sequence[str], params: Sequence[str], width: int) -> str:
+    """A table as MLflow's *Share view* writes it: only so are parameters and metrics columns without a click each.
+
+    It begins with the highest of the first column: sorted by time, it would fold runs below their reproductions.
+    """
+    name, metrics = "attributes.`Run Name`", [f"metrics.`{each}`" for each in measured]
+    others = [f"params.`{each}`" for each in params]
+    view: dict[str, object] = {
+        "columnOrder": [name, *metrics, *others],
+        "columnWidths": {name: 190, **dict.fromkeys(metrics, width), **dict.fromkeys(others, 110)},
+        "selectedColumns": [*metrics, *others],
+        "searchFilter": f"tags.`{KIND}` = '{kind}'",
+        "orderByKey": [*metrics, *others][0],
         "orderByAsc": False,
         "startTime": "ALL",
         "lifecycleFilter": "Active",
@@ -215,7 +226,4 @@ def _front_page(experiment: str, runs: Sequence[Any]) -> dict[str, str]:
         "runsExpanded": {},
         **{key: [] for key in ("datasetsFilter", "runsPinned", "runsHidden")},
     }
-    return {
-        NOTE: f"[All variants with their accuracies]({TABLE.format(experiment)}) · docs/dashboard.md",
-        VIEW: json.dumps(view),
-    }
+    return json.dumps(view)

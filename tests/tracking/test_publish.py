@@ -98,7 +98,13 @@ def test_a_new_task_is_a_column_by_itself(again: FakeChain) -> None:
     assert view["selectedColumns"] == [*tasks, *(f"params.`{a}`" for a in ("encoder", "lora", "opd", "seed"))]
     found = client().search_runs([experiment.experiment_id], view["searchFilter"])
     assert {run.info.run_name.removesuffix(PLUMBING) for run in found} == {FULL, BASE}
-    assert "viewStateShareKey=variants" in experiment.tags["mlflow.note.content"]
+    stages = json.loads(experiment.tags["mlflow.sharedViewState.stages"])
+    assert stages["selectedColumns"] == ["metrics.`system/seconds`", "metrics.`system/peak_memory_mb`"]
+    found = client().search_runs([experiment.experiment_id], stages["searchFilter"])
+    costs = {"system/seconds", "system/peak_memory_mb"}
+    assert {run.info.run_name for run in found if costs <= set(run.data.metrics)} == set(TITLES)
+    for table in ("variants", "stages"):
+        assert f"viewStateShareKey={table}" in experiment.tags["mlflow.note.content"]
 
 
 def test_a_run_of_a_fold_has_that_folds_accuracies(chain: FakeChain) -> None:
