@@ -141,7 +141,8 @@ def reproduce(root: Path, arguments: list[str]) -> int:
         places = cores() // runtime.threads if runtime.threads and runtime.device == "cpu" and not arguments else 1
         if min(places, len(waits)) > 1:
             ended = side_by_side(waits, places)
-        ended = ended or int(dvc(["repro", *arguments]))
+        quiet = ["--quiet"] * (min(places, len(waits)) > 1)  # All has run: a line a stage would say so.
+        ended = ended or int(dvc(["repro", *quiet, *arguments]))
         if stopped and isinstance(stopped[0], KeyboardInterrupt):
             raise KeyboardInterrupt
         if ended:

@@ -84,7 +84,15 @@ def test_the_notebook_runs(made: Made) -> None:
         for cell in done.cells
         if cell.cell_type == "code"
     ]
-    assert shown[1] == "('hardness', 'roughness', 'bumpiness')"
-    assert "'hardness'" in shown[2]
-    assert shown[3].strip(), "an answer"
-    assert len(eval(shown[4])) == 3
+    names = [video.name for video in sorted(made.videos.glob("*.avi"))[:3]]
+    assert shown[0] == "('hardness', 'roughness', 'bumpiness')"
+    assert "hardness: soft" in shown[1]
+    assert all(name in shown[1] for name in names)
+    plots = [
+        o.data["image/png"] for cell in done.cells for o in cell.get("outputs", ()) if "image/png" in o.get("data", ())
+    ]
+    assert len(plots) == 1, "of the press"
+    assert "from 0 to 2" in shown[3], "the heads' verdict"
+    assert shown[4].strip(), "an answer"
+    recognised = dict(eval(shown[5]))
+    assert max(recognised, key=recognised.__getitem__) == names[0].removesuffix(".avi")
