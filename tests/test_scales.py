@@ -21,6 +21,7 @@ from pipeline.scales import compose
 from pipeline.scales.cost import card, costs, disk, embedded
 from pipeline.scales.memory import GIB, Use, count, launched, read_shapes, trained_parameters
 from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.split import ENOUGH, MORE, few
 from pipeline.weights.check import parameters, read_language, read_tower
 from tests.checkpoints import write_clip, write_llama
 from tests.closure import ROOT
@@ -224,3 +225,18 @@ def test_a_plan_needs_nothing_and_writes_nothing(monkeypatch: pytest.MonkeyPatch
     said = CliRunner().invoke(app, ["scale", "paper-13b", "--plan"])
     assert said.exit_code == 0, said.output
     assert "8 variants; nothing is written." in said.output
+
+
+def test_few_objects_are_named_by_all_that_look_at_them(tmp_path: Path, catalogue: Catalogue) -> None:
+    """Of twelve, a fold of three has seven to train on; files need not decode for that."""
+    for name in list(catalogue.objects)[:12]:
+        (tmp_path / f"{name}_0.mp4").touch()
+    videos = ["data.source=videos", f"data.dir={tmp_path}"]
+    for scale in (["small", "--plan"], ["small"]):
+        said = CliRunner().invoke(app, ["scale", *scale, *videos]).output
+        assert f"Objects under seed 0: 7 objects to train on, 1 to validate, 4 to test; {MORE}." in said
+    document, _, section = MORE.partition("(")[2].strip(")").partition(", ")
+    assert f"\n## {section}\n" in (ROOT / document).read_text()
+    parts = dict.fromkeys(list(catalogue.objects)[:ENOUGH], Part.TRAIN)
+    assert not few(parts, parts)
+    assert few(parts, list(parts)[1:]).startswith("9 objects to train on")

@@ -13,7 +13,7 @@ from pipeline.training.embeddings import FLIPS
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import list_videos
 from pipeline.videos.frames.selection import kept_count
-from pipeline.videos.split import assign_objects
+from pipeline.videos.split import MORE, assign_objects, few
 from pipeline.weights import DOWNLOADED
 from pipeline.weights.check import parameters
 
@@ -53,6 +53,9 @@ def costs(params: Params, shapes: Shapes) -> Iterator[str]:
             yield f"Download: {found.repository}, {gigabytes}, to {folder} (README, Real videos, real weights)."
     if params.data.source == "videos" and not place.is_dir():
         yield f"Videos: {params.data.dir} is not there (README, Real videos, real weights)."
+    for seed in params.ablation.seeds if objects else ():
+        if said := few(assign_objects(shapes.catalogue, {*objects}, params.split, seed), {*objects}):
+            yield f"Objects under seed {seed}: {said}; {MORE}."
     yield disk(params, shapes, objects, fetched)
     devices, sharded = launched(params.runtime.launcher)
     if shapes.llm is not None and sharded:

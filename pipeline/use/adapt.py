@@ -28,6 +28,7 @@ from pipeline.use.folder import CATALOGUE, CONFIG, ENCODER_DIR, FITTED, TRAINED,
 from pipeline.use.model import Octopi
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import list_videos, raise_errors
+from pipeline.videos.split import MORE
 
 log = logging.getLogger(__name__)
 
@@ -110,9 +111,7 @@ def adapt(
     if catalogue is not None:
         objects = [name for name, video in zip(objects, encoded, strict=True) if video.touched]
         if len({*objects}) < 2:
-            raise UserError(
-                f"{counted(len({*objects}), 'rated object')} with touches; heads need two, a dozen is better"
-            )
+            raise UserError(f"{counted(len({*objects}), 'rated object')} with touches; heads need two, better {MORE}")
     encoded = [video for video in encoded if video.touched]
     if sum(len(video.raw) for video in encoded) < 2:
         raise UserError("one frame has no deviation; name more videos")

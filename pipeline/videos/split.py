@@ -19,6 +19,9 @@ from pipeline.videos.records import Assignment, Video
 VALIDATION = 8
 """With kfold, one in so many of the objects that are not tested is for validation; a whole fold would leave too few to
 train on."""
+ENOUGH = 10
+"""Rated objects from which `octopi adapt` was measured to describe new ones better than without any (docs/data.md)."""
+MORE = f"{ENOUGH} or more to learn from (docs/data.md, How many objects are enough?)"
 
 
 def assign(catalogue: Catalogue, videos: Sequence[Video], config: SplitConfig, seed: int = 0) -> list[Assignment]:
@@ -60,6 +63,12 @@ def assign_objects(
     if not any(parts.get(object_id) == Part.TRAIN for object_id in present):
         raise UserError(f"split {name}: no video of a training object; add videos, or choose another split.name")
     return parts
+
+
+def few(parts: Mapping[str, Part], present: Collection[str]) -> str:
+    """In words, how many objects with videos are for what, where those for training are fewer than `ENOUGH`."""
+    train, validate, test = (sum(parts.get(o) is part for o in present) for part in list(Part)[:3])
+    return "" if train >= ENOUGH else f"{train} objects to train on, {validate} to validate, {test} to test"
 
 
 def untested(parts: Mapping[str, Part], present: Collection[str]) -> str:

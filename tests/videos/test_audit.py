@@ -119,6 +119,8 @@ def test_every_fold_is_audited(workplace: Path, catalogue: Catalogue) -> None:
     assert [f.severity for f in of(both, "same content")] == [ERROR, WARNING, INFO]
     assert set(one) <= set(both)
     assert len(set(both)) == len(both)
+    few = [(f.item, f.measured.split(",")[0]) for f in of(both, "objects")]
+    assert few == [("split 0", "4 objects to train on"), ("split 1", "3 objects to train on")]
 
 
 @pytest.fixture(scope="module")

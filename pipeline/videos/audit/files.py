@@ -8,6 +8,7 @@ from statistics import fmean, median
 
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.records import Finding, Probe, Severity, finding
+from pipeline.videos.split import ENOUGH, MORE
 
 SHORT = 0.5
 """A video with less than this share of the median length at its frame rate is named."""
@@ -68,7 +69,8 @@ def unsteady(first: int, frames: int) -> str:
 
 def _overview(probes: Sequence[Probe], catalogue: Catalogue) -> Iterator[Finding]:
     videos = Counter(p.object_id for p in probes)
-    yield finding("videos", "all", f"{len(probes)} videos of {len(videos)} objects")
+    enough = MORE if len(videos) < ENOUGH else ""
+    yield finding("videos", "all", f"{len(probes)} videos of {len(videos)} objects", enough)
     spread = sorted(Counter(videos.values()).items())
     yield finding("videos per object", "all", ", ".join(f"{n} objects with {count}" for count, n in spread))
     absent = sorted(catalogue.objects.keys() - videos)

@@ -18,7 +18,7 @@ from pipeline.videos.files import VideoFile, list_videos
 from pipeline.videos.frames.probe import probe
 from pipeline.videos.frames.scan import scan
 from pipeline.videos.records import Assignment, Finding, Probe, Severity, finding
-from pipeline.videos.split import assign
+from pipeline.videos.split import MORE, assign, few
 
 AUDIT_FILE = "audit.csv"
 
@@ -56,6 +56,10 @@ def audit_chain(
         for close in get_close_matches(name, catalogue.objects, n=1, cutoff=0.9):
             found.append(finding("spelling", name, "not in the catalogue", f"{close}?", Severity.WARNING))
     found += [*wrong, *check_labels(catalogue), *check_files(probes, catalogue)]
+    for fold, assigned in enumerate(splits):
+        parts = {a.object_id: a.part for a in assigned}
+        if said := few(parts, parts):
+            found.append(finding("objects", f"split {fold}", said, MORE))
     found += check_leakage(probes, splits, catalogue)
     # Most findings are the same under every split.
     return by_severity(dict.fromkeys(found))
