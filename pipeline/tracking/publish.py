@@ -215,7 +215,7 @@ def _table(kind: str, measured: Sequence[str], params: Sequence[str], width: int
     others = [f"params.`{each}`" for each in params]
     view: dict[str, object] = {
         "columnOrder": [name, *metrics, *others],
-        "columnWidths": {name: 190, **dict.fromkeys(metrics, width), **dict.fromkeys(others, 110)},
+        "columnWidths": {name: 250, **dict.fromkeys(metrics, width), **dict.fromkeys(others, 110)},
         "selectedColumns": [*metrics, *others],
         "searchFilter": f"tags.`{KIND}` = '{kind}'",
         "orderByKey": [*metrics, *others][0],
