@@ -13,7 +13,7 @@ from pipeline.videos.records import Assignment, Video
 
 if __name__ == "__main__":
     with stage("evaluate") as run:
-        from pipeline.use.evaluate import answers_about, answers_after_ratings
+        from pipeline.use.evaluate import answers_about, answers_after_ratings, check_rated
         from pipeline.use.model import Octopi
 
         params, graded = run.params, list[GradedVision]()
@@ -25,6 +25,7 @@ if __name__ == "__main__":
             limit_threads(2)
         # With folds each object is a test object of one of them.
         splits = {seed: read_table(split_file(seed), Assignment) for seed in params.ablation.seeds}
+        check_rated(params.evaluate.rated, splits)
         assigned = sorted((a for split in splits.values() for a in split), key=lambda a: a.part == "test")
         parts, videos = {a.object_id: a.part for a in assigned}, read_table(VIDEOS, Video)
         for folder in params.evaluate.models:

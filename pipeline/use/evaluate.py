@@ -83,6 +83,16 @@ def answers_about(
     return _graded(octopi, octopi.name, params, catalogue, videos, asked, standardised=standardised)
 
 
+def check_rated(counts: Sequence[int], splits: Mapping[int, Sequence[Assignment]]) -> None:
+    """Raise UserError where a seed's split trains on fewer objects than are to be rated, before hours are spent."""
+    for seed, assigned in splits.items():
+        known = len({a.object_id for a in assigned if a.part is Part.TRAIN})
+        if counts and max(counts) > known:
+            raise UserError(
+                f"evaluate.rated: {max(counts)} objects, but seed {seed} trains on {known}; name at most as many"
+            )
+
+
 def answers_after_ratings(
     octopi: Octopi, params: Params, videos: Sequence[Video], assigned: Sequence[Assignment], seed: int, count: int
 ) -> list[GradedVision]:
@@ -95,16 +105,12 @@ def answers_after_ratings(
         count: 0 adapts by the videos of all training objects, without their ratings.
 
     Raises:
-        UserError: where the split has fewer training objects, or as `adapt` has it.
+        UserError: as `adapt` has it.
     """
     if (catalogue := _asking(octopi, params)) is None:
         return []
     folder, rated = Path(params.data.dir), load_catalogue(Path(params.data.catalogue))
     names = sorted({a.object_id for a in assigned if a.part is Part.TRAIN})
-    if count > len(names):
-        raise UserError(
-            f"evaluate.rated: {count} objects, but seed {seed} trains on {len(names)}; name at most as many"
-        )
     random.Random(derive_seed(seed, "rated")).shuffle(names)
     own = [v for v in videos if v.object_id in names[: count or None]]
     tested = {a.video_id for a in assigned if a.part is Part.TEST}

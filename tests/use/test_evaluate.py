@@ -32,7 +32,7 @@ from pipeline.scales import compose, write_params
 from pipeline.tasks.base import find_level
 from pipeline.use import folder
 from pipeline.use.adapt import adapt
-from pipeline.use.evaluate import answers_about, answers_after_ratings
+from pipeline.use.evaluate import after_ratings, answers_about, answers_after_ratings, check_rated
 from pipeline.use.folder import Base, find_base, read_folder
 from pipeline.use.model import REAL, Octopi, on_real_videos
 from pipeline.videos.catalogue import Catalogue, load_catalogue
@@ -98,6 +98,27 @@ def test_the_readmes_table_is_that_of_the_report() -> None:
         told = [f"{100 * model['chance']:.1f}", f"{theirs[task]:.1f}"]
         assert row[1:] == [measured(model), f"{100 * rules['accuracy']:.1f}", *told]
         assert task not in row[0], "in words"
+
+
+def curve() -> list[str]:
+    """Lines of a table: by how many objects were rated, what the language model and heads had right of others."""
+    found = load_report(ROOT / "reports" / "evaluate-videos").scores.query(f"seed == {ALL_SEEDS!r}")
+    found = found[found["measure"].isin(["choice", "combined"])].set_index(["encoder", "touch", "task"])
+    lines = []
+    for count in (0, 3, 5, 10, 20, 38):
+        cells = []
+        for task in ("OPD", "PC", "PSS", "POM", "PSR"):
+            name = after_ratings(SHIPPED.name, count)
+            model, rules = (dict(found.loc[(name, shown, task)]) for shown in ("touch", "classes"))
+            said = measured(model) if task == "OPD" else f"{100 * model['accuracy']:.1f}"
+            cells.append(f"{said} / {100 * rules['accuracy']:.1f}")
+        lines.append(f"| {count or 'none'} | {' | '.join(cells)} |")
+    return lines
+
+
+def test_the_learning_curve_of_the_documents_is_that_of_the_report() -> None:
+    document = (ROOT / "docs" / "data.md").read_text(encoding="utf-8")
+    assert "\n".join(curve()) in document
 
 
 def test_its_language_model_is_made_once(
@@ -225,8 +246,10 @@ def test_after_ratings_it_answers_as_the_copy_that_adapt_makes(
                 assert row.predicted == said.levels["hardness"]
             elif row.measure == "hardness":
                 assert f" {row.predicted} " in said.sentence
-    with pytest.raises(UserError, match=r"evaluate.rated: 3 objects, but seed 0 trains on 2"):
-        answers_after_ratings(octopi, params, videos, split, 0, 3)
+    check_rated([], {0: split})
+    check_rated([0, 2], {0: split})
+    with pytest.raises(UserError, match=r"evaluate.rated: 3 objects, but seed 1 trains on 2"):
+        check_rated([0, 3], {1: split})
 
 
 @pytest.mark.parametrize("update", [{"name": "warmth"}, {"levels": ("yielding", "springy", "rigid")}])
