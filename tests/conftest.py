@@ -77,6 +77,17 @@ def refused(words: str) -> Any:
     return pytest.raises(UserError, match=words, check=lambda error: "\n" not in str(error))
 
 
+def octopi(*words: object, status: int = 0) -> str:
+    """What `octopi WORDS...` prints; what it refuses is raised."""
+    from typer.testing import CliRunner
+
+    from pipeline.cli import app
+
+    done = CliRunner().invoke(app, [*map(str, words)], catch_exceptions=False)
+    assert done.exit_code == status, done.output
+    return done.output
+
+
 def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
     """Mark what `make test-fast` leaves out: the chain, benchmarks, files that start processes, the large model."""
     for item in items:

@@ -13,13 +13,11 @@ from pathlib import Path
 
 import pytest
 from dvc.repo import Repo
-from typer.testing import CliRunner
 
-from pipeline.cli import app
 from pipeline.cli.diff import compare
 from pipeline.core.io import write_table
 from pipeline.evaluation.records import Graded
-from tests.conftest import refused
+from tests.conftest import octopi, refused
 from tests.evaluation.conftest import graded
 
 REPORT = "reports/smoke-scenes"
@@ -187,15 +185,13 @@ def test_an_unknown_revision_or_folder_is_refused(
 
 def test_what_a_person_sees(history: History, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(history.folder)
-    same = CliRunner().invoke(app, ["diff", "first", "again"])
-    assert (same.exit_code, same.output.strip()) == (0, "No parameter, metric or answer differs")
+    assert octopi("diff", "first", "again").strip() == "No parameter, metric or answer differs"
     file = tmp_path / "out" / "compared.json"
-    other = CliRunner().invoke(app, ["diff", "again", "longer", "--json", str(file)])
-    assert other.exit_code == 0, other.output
+    told = octopi("diff", "again", "longer", "--json", file)
     for words in (r"epochs +4 +5", r"smoke-scenes\.OPD +0\.25 +0\.75", r"finetuned with all real +new - old +OPD"):
-        assert re.search(words, other.output), words
+        assert re.search(words, told), words
     history.git("update-ref", "refs/exps/ab/cdef/odd-name", "longer")
-    assert re.search(r"epochs +4 +5", CliRunner().invoke(app, ["diff", "again", "odd-name"]).output)
+    assert re.search(r"epochs +4 +5", octopi("diff", "again", "odd-name"))
     written = json.loads(file.read_text())
     assert written["differs"] is True
     assert written["tested"][0]["task"] == "OPD"

@@ -10,9 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from typer.testing import CliRunner
 
-from pipeline.cli import app
 from pipeline.core.records import Part
 from pipeline.evaluation.grading import grade
 from pipeline.tasks import TASKS
@@ -22,7 +20,7 @@ from pipeline.use.package import export, package
 from pipeline.videos.catalogue import load_catalogue
 from tests.checkpoints import contents, edit, write_llama
 from tests.closure import ROOT
-from tests.conftest import refused
+from tests.conftest import octopi, refused
 from tests.fake_run import fake_params
 from tests.use.shared import PARTS, Made
 
@@ -90,8 +88,7 @@ def test_export_with_its_base_needs_nothing_else(made: Made, copy: Path, files: 
     expected = Octopi.from_pretrained(made.folder).ask(*question)
     with refused(r"language model llama is not there .*--base"):
         Octopi.from_pretrained(copy)
-    command = ["export", str(made.folder), str(tmp_path / "whole"), "--with-base"]
-    assert CliRunner().invoke(app, command).exit_code == 0
+    octopi("export", made.folder, tmp_path / "whole", "--with-base")
     assert Octopi.from_pretrained(tmp_path / "whole").ask(*question) == expected
     with refused("is there already"):
         export(made.folder, tmp_path / "whole")
