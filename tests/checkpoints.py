@@ -27,12 +27,10 @@ def edit(file: Path, **changes: Any) -> None:
 
 
 def cut(file: Path, by: int = 1) -> None:
-    """Take the last bytes of a file away."""
     file.write_bytes(file.read_bytes()[:-by])
 
 
 def replace(file: Path, name: str, value: torch.Tensor) -> None:
-    """Put another tensor into a safetensors file."""
     save_file(load_file(file) | {name: value}, file)
 
 

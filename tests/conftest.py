@@ -275,7 +275,6 @@ def tiny_videos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def few_permutations(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Few permutations in the audit of leakage, where they are not what is tested."""
     monkeypatch.setattr("pipeline.videos.audit.leakage.PERMUTATIONS", 50)
 
 

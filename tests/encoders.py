@@ -72,7 +72,6 @@ def config(weights: Path, recipe: RecipeName, **changes: object) -> EncoderConfi
 
 
 def training(data: EncoderData, setting: EncoderConfig, seed: int = 0, **more: Any) -> Training:
-    """A training on the CPU that depends on no other file."""
     return Training(data, setting, CPU, seed, (), **more)
 
 

@@ -79,7 +79,6 @@ def scanned(path: Path, config: FramesConfig = CONFIG, video_id: str = "rug_0") 
 
 @contextmanager
 def promising(frames: int) -> Iterator[None]:
-    """Headers that promise so many frames."""
     init = Decoder.__init__
 
     def lying(self: Decoder, path: Path) -> None:
@@ -133,8 +132,6 @@ def pillow(image: np.ndarray, size: int, mode: str) -> np.ndarray:
 
 
 class Place:
-    """A folder of videos, and where its frames go."""
-
     def __init__(self, folder: Path, root: Path, catalogue: Catalogue) -> None:
         self.folder, self.catalogue = folder, catalogue
         self.out, self.partial, self.log = root / "out é", root / "partial", root / "decoded.txt"

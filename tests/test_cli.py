@@ -90,7 +90,6 @@ def lines(output: str, severity: str) -> list[str]:
 
 @pytest.fixture
 def folder(project: Path, few_permutations: None) -> Path:
-    """Two videos that decode."""
     for seed, name in enumerate(("baseball_0", "potato_0")):
         write_video(project / "videos" / f"{name}.avi", moving_square(8, seed))
     return project / "videos"

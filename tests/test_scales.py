@@ -55,9 +55,7 @@ def kept(run: Callable[[], torch.Tensor], modules: Iterable[nn.Module]) -> int:
         ("lora", True, "all-linear", 2, "bfloat16"),
     ],
 )
-def test_a_training_step_trains_and_keeps_what_is_counted(
-    stage: str, words: bool, targets: str, keys: int, dtype: str, tmp_path: Path
-) -> None:
+def test_a_step_is_as_counted(stage: str, words: bool, targets: str, keys: int, dtype: str, tmp_path: Path) -> None:
     """Of what autograd keeps, the small change is not counted, and a byte for dropout that is not there is."""
     weights = write_llama(
         tmp_path, hidden_size=64, intermediate_size=160, num_hidden_layers=3, num_key_value_heads=keys

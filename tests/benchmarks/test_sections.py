@@ -52,7 +52,6 @@ def project(catalogue: Catalogue, tmp_path_factory: pytest.TempPathFactory) -> P
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The project's own videos, and few fits of the heads."""
     monkeypatch.delenv("OCTOPI_DATA_DIR", raising=False)
     for name, value in (("STRENGTHS", (1e-3,)), ("FOLDS", 2), ("ROUNDS", 5)):
         monkeypatch.setattr(frame_classifier, name, value)
@@ -102,9 +101,7 @@ def test_encoder(project: Path, tmp_path: Path) -> None:
     assert all((row.n, row.frames) == (12, 5) for row in found["frame size"].values())
 
 
-def test_systems_take_errors_from_the_report_and_times_from_the_shipped_model(
-    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_systems_by_report_and_shipped_model(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(systems, "SHIPPED", trained)
     with refused("scores.csv: has no answers of the shipped model; run `make repro` first"):
         systems.measure(tmp_path)
@@ -134,9 +131,7 @@ def test_contact(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert all(row.n == 6 for row in found["contact"].values())
 
 
-def test_serving_asks_a_fresh_process_and_a_server(
-    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_serving_by_a_process_and_a_server(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in PORTABLE.items():  # In half precision an answer depends on its batch, where AMX sums it.
         monkeypatch.setenv(name, value)
     rows = {row.setting: row for row in serving.measure(tmp_path, clients=3, each=2)}

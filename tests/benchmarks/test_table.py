@@ -81,9 +81,7 @@ def test_errors_have_intervals_over_objects() -> None:
     assert Error.of(score.model_copy(update={"low": None, "high": None})).columns == {"error": 0.5, "n": 9}
 
 
-def test_the_command_merges_and_names_what_is_allowed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     from benchmarks import contact
 
     monkeypatch.chdir(tmp_path)

@@ -27,7 +27,6 @@ def designs(draw: st.DrawFn) -> About:
 
 
 def single(objects: int, each: int) -> About:
-    """So many questions about each of so many objects."""
     return tuple((f"{o:02}",) for o in range(objects) for _ in range(each))
 
 

@@ -120,9 +120,7 @@ def graded() -> list[GradedVision]:
     return read_table(Path("data/graded_vision.parquet"), GradedVision)
 
 
-def test_frames_and_questions_arrive_whole_and_become_rows_of_the_report(
-    endpoint: SimpleNamespace, catalogue: Catalogue
-) -> None:
+def test_frames_and_questions_arrive_and_become_report_rows(endpoint: SimpleNamespace, catalogue: Catalogue) -> None:
     """Of the two comparisons one reply is wrong and cannot be read; all others are right."""
     wrong = [question.task for question, _, _ in turns()].index("PC")
     endpoint.step = lambda n: reply("Perhaps.") if n == wrong else right(n)
@@ -153,9 +151,7 @@ def test_frames_and_questions_arrive_whole_and_become_rows_of_the_report(
     assert not [f for f in PLACE.iterdir() if KEY.encode() in f.read_bytes()]
 
 
-def test_examples_are_the_first_of_each_answer_and_at_most_three(
-    endpoint: SimpleNamespace, catalogue: Catalogue
-) -> None:
+def test_examples_are_the_first_of_each_answer_at_most_three(endpoint: SimpleNamespace, catalogue: Catalogue) -> None:
     training = read_jsonl(QUESTIONS / "train.jsonl", Question)
     for task, count in {"PC": 3, "PSS": 1, "POM": 3, "PSR": 0}.items():
         first = {q.gold.choice: q for q in reversed(training) if q.task == task}
@@ -253,9 +249,7 @@ def test_what_is_missing_or_would_tell_the_key_is_one_line_and_asks_nothing(endp
     assert endpoint.bodies == []
 
 
-def test_answers_to_other_questions_or_frames_are_left_out_aloud(
-    endpoint: SimpleNamespace, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_outdated_answers_are_left_out_aloud(endpoint: SimpleNamespace, caplog: pytest.LogCaptureFixture) -> None:
     run()
     for expected in (0, 10):  # The other way round, and back.
         write_jsonl(QUESTIONS / "evaluation.jsonl", read_jsonl(QUESTIONS / "evaluation.jsonl", Question)[::-1])

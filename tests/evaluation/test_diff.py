@@ -100,7 +100,6 @@ def history(tmp_path_factory: pytest.TempPathFactory) -> History:
 
 @pytest.fixture
 def copy(history: History, tmp_path: Path) -> History:
-    """One to change."""
     return History(shutil.copytree(history.folder, tmp_path / "copy", symlinks=True))
 
 
@@ -172,9 +171,7 @@ def test_an_address_is_shown_without_its_password(copy: History) -> None:
     assert "S3cret" not in found
 
 
-def test_an_unknown_revision_or_folder_is_refused(
-    history: History, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unknown_revisions_are_refused(history: History, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for revision in ("nowhere", "--all", "HEAD:params.yaml", "first..again"):
         with refused(f"^{revision}: no commit of a Git repository"):
             compare(history.folder, revision)

@@ -54,8 +54,6 @@ def test_one_seed_and_all_of_them() -> None:
 
 
 def test_tasks_and_measures_come_from_the_registry(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Their order, their chance; a task that is registered later appears by itself."""
-
     class Later(type(TASKS["PC"])):  # type: ignore[misc]
         name, measure = "LATER", "shape"
 

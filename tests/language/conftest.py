@@ -47,7 +47,6 @@ def generation(batch_size: int, tokens: int = 12) -> LanguageConfig:
 
 
 def taking(samples: int, **own: float | str) -> LoraTrainConfig:
-    """Settings that take so many questions."""
     return LoraTrainConfig(samples=samples, **own)
 
 
@@ -76,7 +75,6 @@ def adapted(model: OctopiForCausalLM, config: LoraTrainConfig = LORA) -> OctopiF
 
 
 def call(model: OctopiForCausalLM) -> dict[str, torch.Tensor]:
-    """A question about two frames."""
     ids = torch.tensor([[5, model.start_id, model.frame_id, model.frame_id, model.end_id, 7, 9]])
     return {"input_ids": ids, "features": torch.randn(1, 2, DIM, generator=torch.manual_seed(3))}
 
@@ -127,7 +125,6 @@ def store(tmp_path_factory: pytest.TempPathFactory, questions: list[Question]) -
 
 @pytest.fixture(scope="session")
 def held(language: LanguageConfig, questions: list[Question], store: EmbeddingStore) -> Material:
-    """All of it, to train with."""
     return material(language, questions, store)
 
 
@@ -139,6 +136,5 @@ def model(language: LanguageConfig) -> OctopiForCausalLM:
 
 @pytest.fixture
 def checkpoints(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where trainings keep theirs."""
     monkeypatch.setattr("pipeline.training.trainer.CHECKPOINTS", tmp_path)
     return tmp_path

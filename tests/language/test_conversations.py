@@ -47,7 +47,7 @@ def test_without_a_begin_token_all_else_is_the_same(held: Material) -> None:
     st.sampled_from([1, 2, 4]),
     st.integers(0, 3),
 )
-def test_an_update_has_the_same_questions_on_any_number_of_devices(
+def test_updates_are_equal_on_any_devices(
     lengths: list[int], micro: int, rounds: int, devices: int, epoch: int
 ) -> None:
     """Those of a random order, as accelerate deals them; in a last update that is too small fillers take part."""
@@ -93,10 +93,7 @@ def test_given_descriptions_are_not_learnt_and_stand_beside_other_touches(share:
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_an_embedding_that_is_not_finite_is_named_by_its_video(
-    value: float, store: EmbeddingStore, tmp_path: Path
-) -> None:
-    """Training and answering read embeddings through the store alone."""
+def test_an_embedding_that_is_not_finite_names_its_video(value: float, store: EmbeddingStore, tmp_path: Path) -> None:
     (tmp_path / INDEX_FILE).write_bytes((store.folder / INDEX_FILE).read_bytes())
     entry = read_table(store.folder / INDEX_FILE, Embedding)[-1]
     tensor = store.tensor.clone()

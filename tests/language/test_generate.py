@@ -21,7 +21,6 @@ from tests.language.conftest import DIM, FRAMES, generation, material, taking
 
 
 def prompt(question: Question, opd: Opd, model: OctopiForCausalLM) -> list[int]:
-    """Token ids of a question's first turn."""
     turns = question.dialogue(opd).turns
     text = render(turns, model.tokenizer, system_prompt="", frames=FRAMES, complete=False)
     return list(encode(text, model.tokenizer).input_ids)
@@ -35,9 +34,7 @@ def by_hand(model: OctopiForCausalLM, question: Question, store: EmbeddingStore,
     return said[-count:]
 
 
-def test_an_answer_at_the_limit_is_whole_and_one_beyond_is_cut(
-    model: OctopiForCausalLM, questions: list[Question], store: EmbeddingStore
-) -> None:
+def test_an_answer_at_the_limit(model: OctopiForCausalLM, questions: list[Question], store: EmbeddingStore) -> None:
     """A token that the model says after some others is made the end token."""
     asked = [q for q in questions if q.task == "OPD"][:3]
     assert all(p.truncated and p.tokens == 8 for p in answer(model, store, asked, Opd.ALL, generation(4, 8), FRAMES))
@@ -52,9 +49,7 @@ def test_an_answer_at_the_limit_is_whole_and_one_beyond_is_cut(
     assert whole.outputs == cut.outputs, "the end token says nothing"
 
 
-def test_an_answer_ends_where_the_positions_do_whatever_its_neighbours(
-    questions: list[Question], store: EmbeddingStore, tmp_path: Path
-) -> None:
+def test_an_answer_ends_where_positions_do(questions: list[Question], store: EmbeddingStore, tmp_path: Path) -> None:
     """Each row has its own limit; with the end token as padding, the cut must still be seen."""
     wide = OctopiForCausalLM.from_base(write_llama(tmp_path / "wide", pad="</s>"), DIM)
     asked = sorted((q for q in questions if q.task == "PSS"), key=lambda q: len(prompt(q, Opd.ALL, wide)))
@@ -70,9 +65,7 @@ def test_an_answer_ends_where_the_positions_do_whatever_its_neighbours(
     assert any(p.tokens == 5 for p in together)
 
 
-def test_a_question_longer_than_the_positions_is_named_with_the_key(
-    questions: list[Question], store: EmbeddingStore, tmp_path: Path
-) -> None:
+def test_a_question_beyond_the_positions(questions: list[Question], store: EmbeddingStore, tmp_path: Path) -> None:
     setting = LanguageConfig(weights=str(write_llama(tmp_path, max_position_embeddings=60)))
     with refused(r"^[A-Z]+-train-\d+: takes \d+ tokens, .* 60 at once; lower frames.per_video"):
         assemble(material(setting, questions, store), taking(4), "test")

@@ -102,9 +102,7 @@ def test_killed_and_resumed_ends_the_same(kind: str, when: str, left: int, held:
     assert ended.history == whole.history, "what is trained waits for the stage to write it"
 
 
-def test_a_checkpoint_s_key_changes_with_each_input(
-    held: Material, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_checkpoint_s_key_has_each_input(held: Material, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A checkpoint holds only what is trained: gone on with on other inputs, it would be neither's."""
     monkeypatch.chdir(tmp_path)
     weights, catalogue = tmp_path / "weights", tmp_path / "catalogue"
@@ -264,9 +262,7 @@ def test_threads_are_the_parameters_where_torch_was_imported_late(tmp_path: Path
 
 
 @pytest.mark.parametrize("tied", [False, True])
-def test_word_embeddings_are_trained_and_the_base_is_not(
-    tied: bool, held: Material, tmp_path: Path, checkpoints: Path
-) -> None:
+def test_words_are_trained_and_the_base_is_not(tied: bool, held: Material, tmp_path: Path, checkpoints: Path) -> None:
     """Also where the base pads with a word, and its matrix is its head too."""
     folder = write_llama(tmp_path / "base", tie_word_embeddings=tied, pad_token_id=1)
     model, data = assemble(replace(held, language=LanguageConfig(weights=str(folder))), taking(4), "test")

@@ -58,7 +58,6 @@ class Page:
         self.root = ElementTree.fromstring(file.read_text(encoding="utf-8"))
 
     def all(self, *tags: str, kind: str = "") -> list[ElementTree.Element]:
-        """Elements by tag, or by class."""
         return [e for e in self.root.iter() if e.tag in tags or kind in e.get("class", "").split()]
 
     def named(self, name: str) -> ElementTree.Element:

@@ -1,7 +1,8 @@
-"""The catalogue of invented objects: evenly dealt classes, each object its own, and scenes that measure as labelled."""
+"""Recipes, listed, drawn or refused; and the catalogue of invented objects, whose scenes measure as labelled."""
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -16,10 +17,10 @@ from pipeline.scenes import invented
 from pipeline.scenes.elastic import solver
 from pipeline.scenes.geometry import Flat
 from pipeline.scenes.invented import classes_of, draw, invented_catalogue, write_catalogue
-from pipeline.scenes.recipe import SceneRecipe, load_recipes
+from pipeline.scenes.recipe import SceneRecipe, load_recipes, recipe_of
 from pipeline.scenes.render import make_scene, measure_scene
-from pipeline.videos.catalogue import load_catalogue
-from tests.closure import ROOT
+from pipeline.videos.catalogue import Catalogue, load_catalogue
+from tests.conftest import ROOT, refused
 
 
 def test_each_combination_comes_as_often() -> None:
@@ -98,3 +99,46 @@ def test_a_killed_drawing_goes_on_from_what_is_finished(here: Path, monkeypatch:
 def test_its_scale_is_checked_before_the_catalogue_is_written(here: Path) -> None:
     check_inputs(compose("invented", ["invent.objects=54"], conf=ROOT / "conf"))
     assert not (here / "data").exists()
+
+
+PHYSICLEAR = ROOT / "pipeline" / "physiclear"
+
+
+def test_every_object_has_a_recipe_of_its_own(catalogue: Catalogue) -> None:
+    recipes = load_recipes(PHYSICLEAR, catalogue, 0)
+    assert list(recipes) == list(catalogue.objects)
+    assert len(set(recipes.values())) == len(recipes) == 74
+    assert recipes == load_recipes(PHYSICLEAR, catalogue, 1), "listed, not drawn"
+
+
+def test_what_is_not_listed_is_drawn(catalogue: Catalogue, tmp_path: Path) -> None:
+    (tmp_path / "scenes.yaml").write_text("rug: {modulus: 0.3, relief: [{kind: rough, rms: 0.02, longest: 0.9}]}\n")
+    recipes = load_recipes(tmp_path, catalogue, 3)
+    assert recipes["rug"].modulus == 0.3
+    assert recipes["rice"] == recipe_of("rice", catalogue, 3) != load_recipes(PHYSICLEAR, catalogue, 3)["rice"]
+    (tmp_path / "scenes.yaml").write_text("# nothing yet\n")
+    assert load_recipes(tmp_path, catalogue, 3)["rug"] == recipe_of("rug", catalogue, 3)
+
+
+def test_scenes_need_their_properties(catalogue: Catalogue, tmp_path: Path) -> None:
+    language = catalogue.language.model_copy(update={"properties": catalogue.properties[1:]})
+    objects = {"rug": catalogue.objects["rug"].model_copy(update={"ratings": catalogue.objects["rug"].ratings[1:]})}
+    fewer = Catalogue.model_construct(language=language, objects=objects)
+    with refused(r"hardness.*three classes each.*data\.source=videos"):
+        load_recipes(tmp_path, fewer, 0)
+    (tmp_path / "scenes.yaml").write_text("rug: {modulus: 0.3}")
+    assert load_recipes(tmp_path, fewer, 0)["rug"].modulus == 0.3, "a listed object needs no labels"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("yoyo: {modulus: 1}", r"yoyo is not in objects\.csv; correct or remove the entry"),
+        ("rug: {modulus: 1, body: {kind: cube}}", r"rug: body: .*cube.*'flat'"),
+    ],
+)
+def test_bad_entries_are_refused_in_one_line(text: str, message: str, catalogue: Catalogue, tmp_path: Path) -> None:
+    file = tmp_path / "scenes.yaml"
+    file.write_text(text)
+    with refused(f"^{re.escape(str(file))}: .*{message}"):
+        load_recipes(tmp_path, catalogue, 0)

@@ -85,7 +85,6 @@ def test_wrong_classes_are_matched_at_the_least_cost() -> None:
 @settings(max_examples=10)
 @given(seed=st.integers(0, 10_000))
 def test_the_right_answers_are_not_looked_at(seed: int) -> None:
-    """Whatever the objects' labels are said to be, answers to PC and PSS stay as they are."""
     labels = shuffled(seed)
     ratings = {o: tuple((level,) for level in labels[o]) for o in TRUE}
     objects = {o: entry.model_copy(update={"ratings": ratings[o]}) for o, entry in CATALOGUE.objects.items()}

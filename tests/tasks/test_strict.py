@@ -42,9 +42,7 @@ def cut_at_words(said: str, right: str) -> list[bool]:
 
 
 @given(LABELS, LABELS, st.integers(0, 400), st.sampled_from(TAILS))
-def test_descriptions_are_cut_like_the_published_ones(
-    right: tuple[int, ...], said: tuple[int, ...], stop: int, tail: str
-) -> None:
+def test_descriptions_are_cut_as_published(right: tuple[int, ...], said: tuple[int, ...], stop: int, tail: str) -> None:
     text = ("The surface feels firm. " + CATALOGUE.structured(said))[:stop] + tail
     assert list(as_published(text, right, CATALOGUE).values()) == cut_at_words(text, CATALOGUE.structured(right))
 

@@ -52,8 +52,6 @@ def watched(params: Params, **values: object) -> Params:
 
 
 class Line(nn.Module):
-    """The smallest thing that a Trainer trains."""
-
     def __init__(self) -> None:
         super().__init__()
         self.layer = nn.Linear(2, 1)
@@ -71,9 +69,7 @@ def fit(params: Params, callbacks: Sequence[Any]) -> Trained:
 
 
 @pytest.mark.parametrize("broken", [False, True], ids=["whole", "the server was away at the end"])
-def test_a_training_and_publishing_share_one_run(
-    chain: FakeChain, monkeypatch: pytest.MonkeyPatch, broken: bool
-) -> None:
+def test_a_training_and_publishing_share_a_run(chain: FakeChain, monkeypatch: pytest.MonkeyPatch, broken: bool) -> None:
     """What a live run lacks of its curve, publishing adds."""
     log_batch = mlflow.MlflowClient.log_batch
 
@@ -182,7 +178,7 @@ def test_an_unfinished_reproduction_of_another_scale_ends(chain: FakeChain) -> N
 
 
 @pytest.mark.parametrize(("on", "rank"), [(False, "0"), (True, "1")])
-def test_without_live_logging_and_beside_the_first_process_mlflow_is_not_imported(
+def test_mlflow_is_not_imported_without_live_logging_or_in_a_second_process(
     chain: FakeChain, on: bool, rank: str
 ) -> None:
     shutil.rmtree("mlruns")
@@ -261,9 +257,7 @@ def test_out_of_reach_costs_one_warning_and_one_call(
         assert "S3cret" not in line
 
 
-def test_a_server_that_dies_while_a_training_goes_on(
-    chain: FakeChain, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_server_that_dies_meanwhile(chain: FakeChain, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     Path("mlruns").rename(tmp_path / "server")
     store = ["--backend-store-uri", f"sqlite:///{tmp_path / 'server' / 'mlflow.db'}"]
     place = ["--host", "127.0.0.1", "--port", "0", "--workers", "1"]

@@ -168,9 +168,7 @@ def test_a_row_of_the_table_has_its_files_name(octopi: Octopi, files: list[Path]
     assert [*table.columns[0].cells] == [files[0].name, str(files[1]), str(twin)]
 
 
-def test_an_unknown_property_is_refused_before_a_model_is_loaded(
-    made: Made, files: list[Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unknown_property_loads_no_model(made: Made, files: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Octopi, "from_pretrained", lambda *_, **__: pytest.fail("loaded"))
     for words in (("compare", *files[:2], "softness"), ("rank", "softness", *files[:2])):
         with refused(r"softness: no property of this model; .*hardness \(harder, softer\)"):
@@ -207,9 +205,7 @@ def test_described_compared_ranked_and_matched_by_command(
         assert [line.partition(": ")[2].partition(" (")[0] for line in lines] == list(matched.heads)
 
 
-def test_a_killed_description_goes_on(
-    octopi: Octopi, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_kill_loses_no_row(octopi: Octopi, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(asking, "BATCH", 1)
     whole, out = tmp_path / "whole.csv", tmp_path / "out.csv"
     describe_folder(octopi, [folder], whole)

@@ -150,7 +150,7 @@ def test_it_tells_touches_apart_from_any_folder(
 
 
 @pytest.mark.slow
-def test_a_runs_videos_are_asked_about_as_they_are_and_standardised(
+def test_a_runs_videos_are_asked_about_both_ways(
     octopi: Octopi, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What it says of them is what it says to a person who asks; an object that it was trained on stops the stage."""
@@ -196,9 +196,7 @@ def test_a_runs_videos_are_asked_about_as_they_are_and_standardised(
 
 
 @pytest.mark.slow
-def test_after_ratings_it_answers_as_the_copy_that_adapt_makes(
-    octopi: Octopi, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_after_ratings_it_answers_as_its_copy(octopi: Octopi, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """About test objects alone, whose ratings it never had; without ratings by the training videos alone."""
     monkeypatch.setattr("pipeline.core.runtime.limit_threads", lambda _: None)
     changed = [f"data.dir={EXAMPLES}", f"data.catalogue={ROOT}/pipeline/physiclear", "data.source=videos"]

@@ -65,9 +65,7 @@ def test_equal_inputs_give_equal_folders(made: Made, tmp_path: Path, monkeypatch
     assert contents(tmp_path / "new") == contents(made.folder)
 
 
-def test_the_stage_packages_the_full_system_and_the_others_on_demand(
-    made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_stage_packages_what_is_asked_for(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each folder holds the whole encoder, and the chain trains eight variants."""
     shutil.copytree(made.folder.parents[1], tmp_path, dirs_exist_ok=True)
     shutil.rmtree(tmp_path / "models")

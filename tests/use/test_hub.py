@@ -74,9 +74,7 @@ def hub(made: Made, tmp_path: Path) -> Iterator[Hub]:
         yield run, files, asked
 
 
-def test_what_is_pushed_comes_back_and_answers_the_same(
-    made: Made, hub: Hub, files: list[Path], tmp_path: Path
-) -> None:
+def test_what_is_pushed_comes_back_and_answers_alike(made: Made, hub: Hub, files: list[Path], tmp_path: Path) -> None:
     run, there, asked = hub
     assert "language/connector.safetensors\n" in run("push", str(made.folder), NAME, "--dry-run")
     assert not asked

@@ -92,9 +92,7 @@ def test_a_batch_answers_as_one_by_one(octopi: Octopi, files: list[Path]) -> Non
     assert short == [d.model_copy(update={"sentence": ""}) for d in described]
 
 
-def test_each_video_is_decoded_once_a_call(
-    octopi: Octopi, files: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_videos_decode_once(octopi: Octopi, files: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """However many there are, and however little of them is remembered; where they are, one call takes all."""
     reading = mock.Mock(wraps=read_touch)
     monkeypatch.setattr(encoding, "read_touch", reading)
@@ -262,9 +260,7 @@ def test_a_model_of_synthetic_touches_says_so_on_every_answer(octopi: Octopi, ma
         ("long " * 1000, 1, "begin a new conversation"),
     ],
 )
-def test_questions_that_do_not_fit_are_refused(
-    question: str, count: int, words: str, octopi: Octopi, files: list[Path]
-) -> None:
+def test_questions_that_do_not_fit(question: str, count: int, words: str, octopi: Octopi, files: list[Path]) -> None:
     for ask in (octopi.ask, octopi.stream):  # Of a stream before the first piece is asked for.
         with refused(words):
             ask(question, files[:count])
@@ -307,9 +303,7 @@ def test_a_changed_file_is_read_anew(octopi: Octopi, tmp_path: Path) -> None:
     assert not np.array_equal(before.frames, octopi.look(file).frames)
 
 
-def test_a_little_touch_and_a_damaged_video_are_noted(
-    made: Made, octopi: Octopi, files: list[Path], tmp_path: Path
-) -> None:
+def test_a_weak_and_a_damaged_video_are_noted(made: Made, octopi: Octopi, files: list[Path], tmp_path: Path) -> None:
     whole = files[0].read_bytes()
     (cut := tmp_path / "cut.avi").write_bytes(whole[: 2 * len(whole) // 3])
     assert any("damaged: only" in note for note in octopi.look(cut).notes)

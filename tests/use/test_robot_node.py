@@ -73,7 +73,6 @@ def example() -> Iterator[ModuleType]:
 
 @pytest.fixture(scope="module")
 def served() -> Iterator[str]:
-    """`octopi serve`, with a token."""
     with running(make_app(FakeOctopi(), "finetuned-with-all-0", token="secret of the robot")) as port:
         yield f"http://127.0.0.1:{port}"
 

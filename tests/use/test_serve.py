@@ -58,7 +58,6 @@ def error(response: Any, status: int) -> str:
 
 
 def test_an_answer_has_openai_s_form(client: TestClient) -> None:
-    """By the types of OpenAI's own client, which know every field and what it may be."""
     began = time.time()
     response = client.post(CHAT, json=body(user(text("How soft is it?"), part(video(1)))))
     answer = ChatCompletion.model_validate(response.json())
@@ -177,7 +176,7 @@ BAD: list[tuple[bytes | dict[str, Any], int, str]] = [
 
 
 @pytest.mark.parametrize(("bad", "status", "words"), BAD)
-def test_bad_requests_are_refused_in_one_line_and_leave_their_place(
+def test_bad_requests_leave_their_place(
     client: TestClient, bad: bytes | dict[str, Any], status: int, words: str
 ) -> None:
     content = bad if isinstance(bad, bytes) else json.dumps(bad).encode()

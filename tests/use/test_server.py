@@ -30,7 +30,6 @@ from tests.use.videos import video
 
 @contextmanager
 def serving(fake: FakeOctopi, **options: Any) -> Iterator[str]:
-    """The address of a server of that model."""
     with running(make_app(fake, "octopi", **options)) as port:
         yield f"http://127.0.0.1:{port}"
 
@@ -62,7 +61,6 @@ def wait_for(condition: Callable[[], bool]) -> None:
 
 
 def test_no_answer_of_many_clients_is_lost_or_mixed_up() -> None:
-    """Each question and each video is its own, so any answer that went astray shows."""
     jobs = [(i, video(i % 10, 4 + i // 10)) for i in range(60)]
     assert len({digest(data) for _, data in jobs}) == 60
 

@@ -38,9 +38,7 @@ def batches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return sizes
 
 
-def test_what_waits_is_one_batch_and_each_answer_is_the_one_given_alone(
-    octopi: Octopi, files: list[Path], batches: list[int]
-) -> None:
+def test_what_waits_is_one_batch_answered_as_alone(octopi: Octopi, files: list[Path], batches: list[int]) -> None:
     """Beside one that is refused, one that breaks, one that is given up before its turn, and one in the middle."""
     alone = [octopi.ask(q, files[:n], max_new_tokens=most) for q, n, most in QUESTIONS]
 
@@ -91,9 +89,7 @@ def test_who_asks_moments_later_is_in_the_same_batch(
     assert batches == [2]
 
 
-def test_a_batch_that_breaks_fails_each_of_its_questions(
-    octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_batch_that_breaks_fails_all(octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
     async def ask() -> list[Any]:
         worker = Worker()
         asked = [worker.answer(lambda: octopi.stream("Why?", files[:1])) for _ in range(3)]

@@ -27,7 +27,6 @@ PAPER = SplitConfig(name="paper")
 
 
 def test_every_broken_file_is_found_and_raises_nothing(tmp_path: Path, catalogue: Catalogue) -> None:
-    """A file of every kind that can be wrong beside some that are right."""
     folder = tmp_path / "videos with é"
     for seed, name in enumerate(("baseball_0", "potato_0", "rug_0", "rug_1", "sub/lemon_0")):
         write_video(folder / f"{name}.avi", moving_square(16, seed))

@@ -185,7 +185,6 @@ def planted(
 
 @pytest.mark.parametrize("seed", range(3))
 def test_predictability_is_ridge_regression_fold_by_fold(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
-    """One a fold and an order, by scikit-learn."""
     monkeypatch.setattr(leakage, "PERMUTATIONS", 5)
     features, labels, objects = planted(seed, leak=0.7, dims=(4, 40, 144)[seed])
     found, null = predictability(features, labels, objects, seed)
@@ -246,7 +245,6 @@ def test_a_picture_that_tells_the_label_is_a_warning(monkeypatch: pytest.MonkeyP
 
 
 def test_what_cannot_be_predicted_is_undefined() -> None:
-    """Of too few objects, and where all have one class."""
     few = leaks(probes(2, OBJECTS[:4]), {}, OTHER)
     same = leaks(probes(), {}, made.relabelled(OTHER, ratings=((0, 0), (1, 1), (2, 2))))
     for findings in (few, same):

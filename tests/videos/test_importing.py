@@ -253,9 +253,7 @@ def test_pictures_are_ordered_as_their_names_count(tmp_path: Path, names: list[s
     assert [int(shot.picture[0, 0, 0]) for shot in film(tmp_path, 25.0)] == [*range(len(names))]
 
 
-def test_a_picture_that_was_cut_off_is_left_out_and_counted(
-    tmp_path: Path, pictures: list[np.ndarray], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_cut_pictures_are_counted(tmp_path: Path, pictures: list[np.ndarray], caplog: pytest.LogCaptureFixture) -> None:
     for number, shown in enumerate(pictures[:6]):
         cv2.imwrite(str(file := tmp_path / f"{number}.jpg"), shown)
         if number in (2, 5):

@@ -36,7 +36,6 @@ def parts(objects: Iterable[str] = OBJECTS, fold: int = 0, **config: Any) -> dic
     st.integers(0, 9),
 )
 def test_every_video_has_one_part_and_every_object_too(name: str, seed: int, objects: set[str], trained: int) -> None:
-    """So no object is both trained on and tested under one seed."""
     videos, config = fake_videos(sorted(objects), 2), SplitConfig(name=name, seed=seed)
     split = assign(CATALOGUE, videos, config, trained)
     assert [a.video_id for a in split] == [v.video_id for v in videos]
@@ -74,7 +73,6 @@ def test_folds_have_each_class_alike(seed: int) -> None:
 
 
 def test_fewer_training_objects_change_no_other_part() -> None:
-    """And are nested."""
     few, more, whole = (parts(fold=1, name="kfold", folds=3, train_objects=n) for n in (5, 10, 0))
     assert few[Part.TRAIN] < more[Part.TRAIN] < whole[Part.TRAIN]
     assert (len(few[Part.TRAIN]), len(more[Part.TRAIN])) == (5, 10)

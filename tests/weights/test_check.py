@@ -172,7 +172,6 @@ def spoil(folder: Path, file: str, name: str) -> None:
 
 
 def disguised(file: Path) -> None:
-    """A pickle under the name of a file of safetensors."""
     torch.save({"a": torch.zeros(1)}, file)
 
 

@@ -66,7 +66,6 @@ def train_pieces(folder: Path, text: str, **how: Any) -> Path:
 
 @pytest.fixture(scope="module")
 def pieces(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A SentencePiece model trained with LLaMA's settings."""
     return train_pieces(tmp_path_factory.mktemp("pieces"), "\n".join(LINES), **LLAMAS_PIECES)
 
 
