@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 import functools
-import io
-import itertools
 import json
 import re
 import runpy
@@ -21,23 +18,24 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.core.io import read_jsonl, read_table, write_jsonl, write_table
+from pipeline.core.io import read_jsonl, read_table, write_jsonl
 from pipeline.core.records import Opd, Part, Prediction, Question, Turn
 from pipeline.evaluation.answer_with import instruction
+from pipeline.evaluation.pictures import frames
 from pipeline.evaluation.records import GradedVision, Shown
 from pipeline.report.load import load_report
 from pipeline.running.errors import UserError
 from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.records import Assignment, Frame
+from pipeline.videos.records import Assignment
 from tests.closure import ROOT, closure
+from tests.encoders import write_frames
 from tests.fake_run import fake_params, write_run
 
 pytestmark = pytest.mark.slow
 URL, KEY = "http://127.0.0.1:1/v1", "sk-a-key-that-nobody-may-see"
-PLACE, QUESTIONS = Path("external/smoke-scenes/some-maker-sees-1-frames"), Path("data/questions/0")
-DRAWN = {7: [0, 1, 2, 4, 5], 3: [0, 1, 2], 1: [0]}
-"""Of so many frames, which the test videos have in turn, five at uniform intervals from the first, each once."""
+PLACE = Path("external/smoke-scenes/some-maker-sees-1-frames")
+FRAMES, QUESTIONS = Path("data/frames"), Path("data/questions/0")
 
 
 def reply(content: Any, ended: Any = "stop", refusal: Any = None, **more: Any) -> httpx2.Response:
@@ -62,7 +60,7 @@ def right(n: int) -> httpx2.Response:
 def endpoint(tmp_path: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     """Keeps what it is sent, in `bodies`, and answers the n-th request (from 0) as the test's `step` says.
 
-    The working directory has a run down to its answers, with frames of noise for the test videos.
+    The working directory has a run down to its answers, with frames of noise of the test videos.
     """
     monkeypatch.chdir(tmp_path)
     full = ("ablation.encoders=[finetuned]", "ablation.lora=[with]", "ablation.opd=[all]", "ablation.touch=[]")
@@ -71,10 +69,7 @@ def endpoint(tmp_path: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPat
     pool, counts = pool_of(Part.TRAIN, split, catalogue), {"PC": 9, "PSS": 1, "POM": 12}
     write_jsonl(QUESTIONS / "train.jsonl", build_questions(pool, counts, seed=0, distinct=True))
     videos = sorted(a.video_id for a in split if a.part is Part.TEST)
-    kept = [(v, i) for v, count in zip(videos, itertools.cycle(DRAWN), strict=False) for i in range(count)]
-    frames = [Frame(video_id=v, frame_index=2 * i, score=0, row=row) for row, (v, i) in enumerate(kept)]
-    write_table(Path("data/frames/frames.parquet"), Frame, frames)
-    np.save("data/frames/frames.npy", np.random.default_rng(0).integers(0, 256, (len(kept), 16, 16, 3), np.uint8))
+    write_frames(FRAMES, {video: (7, 3, 1)[n % 3] for n, video in enumerate(videos)}, side=16)
     endpoint = SimpleNamespace(step=right, bodies=[])
 
     def answer(request: httpx2.Request) -> httpx2.Response:
@@ -102,19 +97,6 @@ def run(*more: str, refused: bool = False) -> str:
     return said
 
 
-def shown_in(body: dict[str, Any]) -> tuple[str, list[list[Image.Image]]]:
-    """The text of the last message with `{tactile}` for each run of pictures, and these pictures."""
-    text, pictures = "", []
-    for kind, parts in itertools.groupby(body["messages"][-1]["content"], lambda part: part["type"]):
-        if kind == "text":
-            text += "".join(part["text"] for part in parts)
-        else:
-            urls = [re.fullmatch(r"data:image/(png|jpeg);base64,(.*)", part["image_url"]["url"]) for part in parts]
-            pictures.append([Image.open(io.BytesIO(base64.b64decode(url[2])), formats=[url[1]]) for url in urls])
-            text += "{tactile}"
-    return text, pictures
-
-
 def graded() -> list[GradedVision]:
     runpy.run_path(str(ROOT / "stages" / "grade.py"), run_name="__main__")
     return read_table(Path("data/graded_vision.parquet"), GradedVision)
@@ -125,18 +107,19 @@ def test_frames_and_questions_arrive_and_become_report_rows(endpoint: SimpleName
     wrong = [question.task for question, _, _ in turns()].index("PC")
     endpoint.step = lambda n: reply("Perhaps.") if n == wrong else right(n)
     assert run() == f"{PLACE}: 10 questions answered by 12 requests (12 stop); `dvc repro` grades them"
-    pixels, index = np.load("data/frames/frames.npy"), read_table(Path("data/frames/frames.parquet"), Frame)
-    training = read_jsonl(QUESTIONS / "train.jsonl", Question)
+    show, training = frames(FRAMES, [], 5), read_jsonl(QUESTIONS / "train.jsonl", Question)
     for (question, number, turn), body in zip(turns(), endpoint.bodies, strict=True):
         assert (body["model"], body["temperature"], body["max_completion_tokens"]) == ("some-maker/sees-1", 0, 1024)
         assert [m["role"] for m in body["messages"]] == ["user", "assistant", "user"][: 2 * number + 1]
-        before = "" if number else instruction(catalogue, Shown.FRAMES, training, question.task)
-        text, pictures = shown_in(body)
-        assert text == before + turn.user
-        assert len(pictures) == turn.user.count("{tactile}") == (0 if number else len(question.videos))
-        for video, found in zip(question.videos, pictures, strict=False):
-            rows = [f.row for f in index if f.video_id == video]
-            np.testing.assert_array_equal([np.asarray(p) for p in found], [pixels[rows[i]] for i in DRAWN[len(rows)]])
+        text = turn.user if number else instruction(catalogue, Shown.FRAMES, training, question.task) + turn.user
+        pictures = [] if number else [show(video) for video in question.videos]
+        assert text.count("{tactile}") == len(pictures)
+        for own in pictures:
+            text = text.replace("{tactile}", "#" * len(own), 1)
+        content = body["messages"][-1]["content"]
+        assert "".join(part.get("text", "#") for part in content) == text
+        shown = [part["image_url"]["url"] for part in content if "text" not in part]
+        assert shown == [url for own in pictures for url in own]
     second = [n for _, n, _ in turns()].index(1)
     assert endpoint.bodies[second]["messages"][0] == endpoint.bodies[second - 1]["messages"][0]
     assert {(s.task, s.parsed) for s in graded() if not s.correct} == {("PC", False)}
@@ -210,57 +193,28 @@ def test_no_answer_is_counted_and_not_asked_for_again(endpoint: SimpleNamespace,
     assert {said[i].truncated for i in lost} == {ended == "length"}
 
 
-def test_photos_stand_in_place_of_the_videos_of_their_objects(endpoint: SimpleNamespace) -> None:
-    """Of each object in a colour of its own: of the first some files in a folder, of the others one of a camera."""
-    first, *others = objects = sorted({o for question, _, _ in turns() for o in question.objects})
-    colours = {name: (20 + 60 * n % 230, 40, 90 * n % 200) for n, name in enumerate(objects)}
-    exif = Image.Exif()
-    exif[0x0112], exif[0x010F] = 6, "A camera's maker"
-    (folder := Path("my photos") / first).mkdir(parents=True)
-    for i in range(7):
-        Image.new("RGB", (8, 8 + i), colours[first]).save(folder / f"{i}.png")
-    (folder / ".hidden.png").write_bytes(b"")
-    (folder / "notes.txt").write_text("no picture")
-    for name in others:
-        Image.new("RGB", (2000, 1000), colours[name]).save(f"my photos/{name}.JPG", format="JPEG", exif=exif)
-    run("--input", "photos", "my photos")
-    for (question, number, turn), body in zip(turns(), endpoint.bodies, strict=True):
-        text, pictures = shown_in(body)
-        assert text.endswith(turn.user)
-        for name, found in zip(question.objects if number == 0 else (), pictures, strict=True):
-            sizes = [(512, 1024)] if name in others else [(8, 8 + i) for i in DRAWN[7]]
-            assert [p.size for p in found] == sizes, "upright, no larger than need be, five of seven"
-            for picture in found:
-                np.testing.assert_allclose(np.asarray(picture).mean((0, 1)), colours[name], atol=3)
-                assert not picture.getexif()
-    assert all(s.shown is Shown.PHOTOS and s.correct for s in graded())
-    (last := Path(f"my photos/{others[-1]}.JPG")).write_bytes(b"no picture")
-    assert f"{last.name}: not a picture" in run("--input", "photos", "my photos", refused=True)
-    last.unlink()
-    assert f"no photo of {others[-1]};" in run("--input", "photos", "my photos", refused=True)
-
-
-def test_what_is_missing_or_would_tell_the_key_is_one_line_and_asks_nothing(endpoint: SimpleNamespace) -> None:
-    assert "name the folder" in run("--input", "photos", refused=True)
-    write_table(Path("other/frames.parquet"), Frame, [])
-    np.save("other/frames.npy", np.zeros((0, 16, 16, 3), np.uint8))
-    assert "no frame of" in run("other", refused=True)
-    assert "OPENAI_API_KEY" in run("--endpoint", f"https://example.org/v1?key={KEY}", refused=True)
-    assert endpoint.bodies == []
-
-
 def test_outdated_answers_are_left_out_aloud(endpoint: SimpleNamespace, caplog: pytest.LogCaptureFixture) -> None:
     run()
     for expected in (0, 10):  # The other way round, and back.
         write_jsonl(QUESTIONS / "evaluation.jsonl", read_jsonl(QUESTIONS / "evaluation.jsonl", Question)[::-1])
         assert len({s.question_id for s in graded()}) == expected
     assert f"{PLACE}: no answers to the questions of seed 0 as they are now" in caplog.text
-    np.save("data/frames/references.npy", np.ones(3))
+    np.save(FRAMES / "references.npy", np.ones(3))
     assert graded() == []
     assert f"{PLACE}: saw other frames than there are now; run `octopi answer-with` again" in caplog.text
     (PLACE / "source.json").write_text("{}")
     with pytest.raises(SystemExit, match=r"source.json: does not say who answered; run `octopi answer-with` again"):
         graded()
+
+
+def test_photos_by_command_and_what_is_missing(endpoint: SimpleNamespace) -> None:
+    assert "name the folder" in run("--input", "photos", refused=True)
+    assert "OPENAI_API_KEY" in run("--endpoint", f"https://example.org/v1?key={KEY}", refused=True)
+    assert endpoint.bodies == []
+    for name in {o for question, _, _ in turns() for o in question.objects}:
+        Image.new("RGB", (8, 8)).save(f"{name}.png")
+    run("--input", "photos", ".")
+    assert all(s.shown is Shown.PHOTOS and s.correct for s in graded())
 
 
 def test_no_stage_can_ask_a_network() -> None:

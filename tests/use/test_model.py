@@ -194,13 +194,6 @@ SAYS = (
     # Class and probabilities of each video's hardness, a question, what follows; an answer that says it, and another.
     ([(0, ONE), (1, TWO)], "Which is softer?", "0.40.*1.00.*first object is softer", "So the first one.", "Both."),
     (
-        [(0, ONE), (1, TWO)],
-        "Is {tactile} harder than {tactile}?",
-        "second object is harder",
-        "No, the second.",
-        "Both.",
-    ),
-    (
         [(1, ONE), (1, TWO)],
         "Which is harder?",
         "0.40.*1.00.*Both objects are similar",
@@ -266,16 +259,13 @@ def test_questions_that_do_not_fit(question: str, count: int, words: str, octopi
             ask(question, files[:count])
 
 
-def test_videos_that_cannot_be_used_are_refused(octopi: Octopi, tmp_path: Path, files: list[Path]) -> None:
+def test_videos_that_cannot_be_used_are_refused(octopi: Octopi, tmp_path: Path) -> None:
     (tmp_path / "text.avi").write_text("no video")
-    whole = files[0].read_bytes()
-    (tmp_path / "cut.avi").write_bytes(whole[: len(whole) // 20])
     one = write_video(tmp_path / "one.avi", moving_square(1))
     still = write_video(tmp_path / "still.avi", [np.full((36, 48, 3), 90, np.uint8)] * 12)
     arrays = [np.zeros((4, 3, 32, 32), np.uint8), np.zeros((0, 32, 32, 3), np.uint8), np.zeros((4, 32, 32, 3))]
     bad: list[tuple[Any, str]] = [
         (tmp_path / "text.avi", "no frame decodes"),
-        (tmp_path / "cut.avi", "no frame decodes|show no touch"),
         (one, "show no touch"),
         (still, "nothing touches the sensor"),
         *((array, "is no video; give uint8") for array in arrays),
@@ -294,13 +284,6 @@ def test_unknown_words_are_refused(octopi: Octopi, files: list[Path]) -> None:
         octopi.match(files, ["rug", "millet", "a unicorn"])
     with refused(r"NAME: soft\|moderately hard\|hard, .*no bumps"):
         octopi.match(files[:2], {"a mug": ("hard", "smooth", "bumpy"), "a rug": ("soft", "rough", "no bumps")})
-
-
-def test_a_changed_file_is_read_anew(octopi: Octopi, tmp_path: Path) -> None:
-    file = write_video(tmp_path / "a.avi", moving_square(20, 5))
-    before = octopi.look(file)
-    write_video(file, moving_square(21, 77))
-    assert not np.array_equal(before.frames, octopi.look(file).frames)
 
 
 def test_a_weak_and_a_damaged_video_are_noted(made: Made, octopi: Octopi, files: list[Path], tmp_path: Path) -> None:
