@@ -50,7 +50,6 @@ def test_a_stage_says_when_it_starts_and_ends_and_what_it_cost(here: Path, capsy
         (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate"), "lower the batch sizes"),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory"), "lower the batch sizes"),
         (OSError(errno.ENOSPC, "No space left on device", "data/x"), "data/x: No space left on device; free space"),
-        (PermissionError(errno.EACCES, "Permission denied", "data/x"), "data/x: Permission denied; "),
         # As safetensors and torch say it.
         (RuntimeError("I/O error: No space left on device (os error 28)"), "No space left on device; free"),
         (RuntimeError("basic_ios::clear: iostream error"), "data/ or checkpoints/: Input/output error"),

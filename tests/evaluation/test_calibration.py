@@ -36,11 +36,6 @@ def test_error_by_hand() -> None:
     assert calibration_error([said(1, 1.0, 0.0)]) == pytest.approx(1)
 
 
-@pytest.mark.parametrize("temperature", [0.5, 1.0, 3.0])
-def test_finds_the_temperature_that_answers_were_made_by(temperature: float) -> None:
-    assert fit_temperature(drawn(2000, temperature)) == pytest.approx(temperature, rel=0.1)
-
-
 def test_minimum_is_where_the_slope_vanishes() -> None:
     """The slope, written out: sums of (expected - mean logit) / T, and the prior's. Two videos are of one object."""
     answers = [said(0, 0.9, 0.1, object_id="a"), said(1, 0.7, 0.3, object_id="a"), said(0, 0.8, 0.2, object_id="b")]

@@ -30,13 +30,8 @@ def test_what_was_found_and_what_it_stands_on() -> None:
     assert "PC full system - heads and rules -17.0, PC real - swapped +10.0 points" in first
     assert "went on from `octopi-small`" in first
     assert "(3 of 5 folds are still to be run)" in first
-    for fact in (
-        "a 2.2 M-parameter Llama, taught by hand",
-        "2 of 5 folds (0, 2)",
-        "Looked at before.",
-        "to be narrow.",
-    ):
-        assert fact in stands_on
+    told = ("a 2.2 M-parameter Llama, taught by hand", "2 of 5 folds (0, 2)", "Looked at before.", "to be narrow.")
+    assert all(fact in stands_on for fact in told)
     assert "**Matching questions** say what the named objects are like" in stands_on
     assert "questions: `restate=True`; lora: `dropout=0.0`; language: `start=" in stands_on
     assert "sha256 `cccccccccccccccc`" in stands_on
@@ -60,10 +55,7 @@ def test_nothing_measured_or_otherwise_is_said_so() -> None:
         ([effect(**TOUCH, task="PSS", p_holm=0.01)], ""),
         ([effect(task="PSS", p_holm=0.01, difference=-0.3)], "PSS with - without -30.0"),
         ([effect(p_holm=0.01), effect("opd", "all - none")], "PC with - without +10.0 points; "),
-        (
-            [effect(part="touch", change="real - removed", p_holm=0.01)],
-            "`real - swapped` can show, which was not tested",
-        ),
+        ([effect("touch", "real - removed", p_holm=0.01)], "`real - swapped` can show, which was not tested"),
     ],
 )
 def test_only_what_is_significant_and_above_chance_holds_up(effects: list[dict[str, Any]], shown: str) -> None:

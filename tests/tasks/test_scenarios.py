@@ -185,13 +185,7 @@ def test_without_videos_of_all_its_objects_an_example_is_not_asked() -> None:
 
 
 READ = {"The rice is a), because it is rough.": "a", "the rice is  (b).": "b"}
-UNREAD = (
-    "The rice is a) or b).",
-    "The rice is a). No, the rice is b).",
-    "The rice is uncooked.",
-    "The handle is a).",
-    "",
-)
+UNREAD = ("The rice is a) or b).", "The rice is a). No, the rice is b).", "The rice is uncooked.", "The handle is a).")
 
 
 @pytest.mark.parametrize(("text", "letter"), [*READ.items(), *dict.fromkeys(UNREAD, "").items()])

@@ -172,10 +172,8 @@ UNREAD = {
     "PC": """
         The first object is harder.
         Yesterday
-        Yes. Conclusion: I cannot say.
         Yes and no.
         Conclusion: No / yes
-        **Yes** / **No**
         **No** answer can be given.
         Conclusion: Yes. Answer: No.
         Conclusion: ~~Yes~~
@@ -184,27 +182,22 @@ UNREAD = {
         """,
     "PSS": """
         d) is the hardest.
-        a) is the hardest. b) is the hardest.
         a) is the same as b).
         The hardest is **a)** or **b)**.
         Answer: A human cannot tell.
-        Conclusion: a), b) or c)
         Conclusion: a) is soft, b) is hard, c) is hard.
         Conclusion: a b)
         a. The surface feels hard.
-        Conclusion: **a)**. Answer: **b)**.
         Answer: b) Conclusion: I cannot tell.
         None of **b)**
         """,
     "RIPE": """
-        The riper avocado is a) or b).
         The riper avocado is a). No: the riper avocado is b).
         The less ripe avocado is a).
         The riper kiwi is a).
         """,
     "PSR": """
         The most suitable object is a) or b).
-        The most suitable object is a). The most suitable object is b).
         The object is a).
         Neither a) nor b) is the most suitable.
         I do not think that b) is the most suitable.
@@ -216,25 +209,19 @@ READ = {
     ("PC", "yes"): """
         **Conclusion:** Yes, the first.
         \\boxed{Yes}
-        The answer is **yes**.
         In conclusion, yes.
-        “Yes”, it is.
         $\\boxed{\\text{Yes, the first}}$
         Conclusion: No. Conclusion: Yes, the first object is harder.
         """,
     ("PC", "same"): "Conclusion: **Both** objects are similar.\nAnswer: both are.",
     ("PSS", "b"): """
         Conclusion: **b)** is the hardest.
-        **b)** is the hardest. So B) is the hardest.
         Option B is the hardest.
         Answer: b
-        The hardest object is b).
-        (b)
         B.
         \\boxed{b}
         **Conclusion:** b), because a) is soft
         b is clearly the hardest
-        Final answer - B
         The most bumpy one is **b**.
         Conclusion: \\(b\\)
         \N{FULLWIDTH LATIN SMALL LETTER B}) is the hardest
@@ -243,13 +230,11 @@ READ = {
         The most suitable object is (b), because a) is soft.
         The most suitable object for cleaning a pan without scratching it is b).
         b) is the best choice.
-        Option B
         The most suitable object is: b)
         the most suitable object is Object b
         """,
     ("RIPE", "b"): """
         The riper avocado is **b)**.
-        Thus b) is riper.
         The Riper Avocado is (B).
         a) is hard, so the riper one is b).
         """,
@@ -288,10 +273,8 @@ PLAIN = ("a lanyard's card holder", "a baseball", "a lemon")
         (PLAIN, "a) is {a}, b) is {b}.", None),
         (PLAIN, "a) is {a}, b) is {b} and c) is {b}.", None),
         (PLAIN, "a) is {a}, a) is {a}, b) is {b} and c) is {c}.", None),
-        (PLAIN, "a) is {a}, b) is {b} and c) is {c}s.", None),
         (PLAIN, "{a}, {b}, {c}", None),
         (PLAIN, "a) is not {a}, b) is {b} and c) is {c}.", None),
-        (PLAIN, "a) {a} or {b}, b) {b}, c) {c}", None),
         (PLAIN, "a) is {a}, b) or c) is {c}", None),
         (("a lanyard", "a tomato", "a potato"), "a) is {a}, b) is {b} and c) is {c}.", True),
         (("a lanyard", "a tomato", "a potato"), "a) is a lanyard's card holder, b) is {b} and c) is {c}.", None),

@@ -157,7 +157,6 @@ TIMES: dict[str, tuple[Callable[[int], int], Callable[[int], int]]] = {
     "in pairs": (PAIRS, EVEN),
     "played slowly, by a simulation's clock": (lambda i: START_NS + 3 * i * STEP_NS, lambda i: i * STEP_NS),
     "no stamps": (PAIRS, lambda i: 0),
-    "one stamp": (PAIRS, lambda i: START_NS),
     "numbers for stamps": (PAIRS, lambda i: START_NS + i),
     "stamps that fall": (EVEN, lambda i: START_NS - i * STEP_NS),
     "stamps of another unit": (EVEN, lambda i: i * 10**12),
