@@ -127,7 +127,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def smollm2_folder() -> Path:
     """SmolLM2-135M-Instruct in transformers' format; leave it as it is."""
-    from tests.models import model_folder
+    from tests.checkpoints import model_folder
 
     return model_folder("smollm2")
 

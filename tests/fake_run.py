@@ -23,9 +23,9 @@ from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.records import Assignment, Finding, Severity, Video
 from pipeline.videos.split import assign
 from pipeline.weights import is_random
+from tests.checkpoints import model_folder
 from tests.closure import ROOT
 from tests.conftest import classified
-from tests.models import model_folder
 
 
 def fake_params(*overrides: str) -> Params:

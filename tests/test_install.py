@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.checkpoints import model_folder
 from tests.closure import ROOT
-from tests.models import model_folder
 
 UV = f"""#!/bin/sh
 mkdir -p .venv/bin

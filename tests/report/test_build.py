@@ -27,10 +27,9 @@ from pipeline.report.page import data_tables, write_page
 from pipeline.report.provenance import base_model, digest
 from pipeline.report.tables import TABLES
 from pipeline.videos.catalogue import Catalogue
-from tests.checkpoints import contents, edit
+from tests.checkpoints import contents, edit, model_folder
 from tests.closure import ROOT
 from tests.fake_run import fake_params, write_run
-from tests.models import model_folder
 
 FILES = {
     *("README.md", "params.yaml", "provenance.json", "metrics.json", "samples.json", "scores.csv", "effects.csv"),

@@ -18,8 +18,7 @@ from pipeline.report.render import WORDS
 from tests.checkpoints import edit
 from tests.closure import ROOT
 from tests.conftest import octopi, refused
-from tests.report.conftest import report, score
-from tests.report.shared import Page, rows_of, words, write_reports, write_rows
+from tests.report.conftest import Page, report, rows_of, score, words, write_reports, write_rows
 
 NUMBER = re.compile(r"[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]\d+)?")
 HOSTILE = "</style><script>alert(1)</script><img src=//evil.example onerror=alert(1)>\"'&"

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.scales import compose
 from tests.closure import ROOT
-from tests.report.shared import rows_of
+from tests.report.conftest import rows_of
 
 HEADER = ["Element", "Paper", "Published code", "Here", "Why"]
 LINES = [line for line in (ROOT / "docs" / "choices.md").read_text(encoding="utf-8").splitlines() if line[:1] == "|"]

@@ -16,10 +16,9 @@ from pipeline.use.few_ratings import Known, Rated, Way, fit, read_anew, standard
 from pipeline.use.folder import CONFIG, find_base, read_folder
 from pipeline.use.model import UNRATED, Octopi
 from pipeline.videos.catalogue import Catalogue, load_catalogue
-from tests.checkpoints import edit
+from tests.checkpoints import edit, model_folder
 from tests.closure import ROOT
 from tests.conftest import refused, write_video
-from tests.models import model_folder
 from tests.use.shared import Made
 
 EXAMPLES = ROOT / "examples"

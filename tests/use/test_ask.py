@@ -19,7 +19,7 @@ from pipeline.use.ask import Chat, describe_folder, described
 from pipeline.use.model import Octopi
 from tests.conftest import not_utf8, refused
 from tests.conftest import octopi as command
-from tests.report.shared import rows_of
+from tests.report.conftest import rows_of
 from tests.use.shared import Made
 
 QUESTION = "Describe {tactile}."

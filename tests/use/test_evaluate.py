@@ -37,9 +37,9 @@ from pipeline.use.folder import Base, find_base, read_folder
 from pipeline.use.model import REAL, Octopi, on_real_videos
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.records import Assignment, Video
+from tests.checkpoints import model_folder
 from tests.closure import ROOT
 from tests.conftest import fake_videos
-from tests.models import model_folder
 
 EXAMPLES = ROOT / "examples"
 LARGEST, RANK, VIDEO = 40e6, 32, 200_000

@@ -19,9 +19,9 @@ from pipeline.use.studio import Sensor
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.film import write_film
 from pipeline.videos.importing.presses import Shot
+from tests.checkpoints import model_folder
 from tests.closure import ROOT
 from tests.conftest import HUNG
-from tests.models import model_folder
 from tests.use.browser import Tab, tab
 from tests.use.test_live import Camera
 from tests.use.videos import recording
