@@ -37,20 +37,10 @@ def probe(video_id: str = "rug_0", **changes: object) -> Probe:
     file = {"session": "", "header_frames": 126, "frames": 126, "fps": 25.0, "width": 320, "height": 240}
     more = {"hdr": False, "rotation": 0, "irregular": 1.0, "kept": 37, "saturated": 0.0, "unsteady": 0}
     light = {"brightness": 90.0, "brightness_step": 0.4, "contact": 1.4, "quiet": 0.25, "contact_end": 0.3}
-    good: dict[str, object] = {
-        **file,
-        **more,
-        **light,
-        "video_id": video_id,
-        "object_id": video_id.rpartition("_")[0],
-        "path": f"{video_id}.mov",
-        "sha256": f"sha of {video_id}",
-        "starts_touching": False,
-        "untouched": (0, 2, 4, 6),
-        "thumbnail": tuple(rng.normal(90, 1, 6 * 8 * 3)),
-        "signature": tuple(contact / np.linalg.norm(contact)),
-    }
-    return Probe.model_validate({**good, **changes})
+    named = {"video_id": video_id, "object_id": video_id.rpartition("_")[0], "path": f"{video_id}.mov"}
+    own = {"sha256": f"sha of {video_id}", "starts_touching": False, "untouched": (0, 2, 4, 6)}
+    own |= {"thumbnail": tuple(rng.normal(90, 1, 144)), "signature": tuple(contact / np.linalg.norm(contact))}
+    return Probe.model_validate({**file, **more, **light, **named, **own, **changes})
 
 
 def probes(videos: int = 3, objects: Sequence[str] = OBJECTS) -> list[Probe]:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from scipy.special import softmax
 
-from pipeline.core.records import Part, Question
-from pipeline.encoder.records import Classification
+from pipeline.core.records import Question
 from pipeline.evaluation.grading import conclude
 from pipeline.language.classes import uncontradicted
 from pipeline.tasks.questions import build_questions
 from pipeline.training.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
+from tests.conftest import classified
 from tests.language.conftest import write_store
 from tests.tasks.shared import CATALOGUE, POOL
 
@@ -45,23 +46,15 @@ def store(logits: dict[str, torch.Tensor], tmp_path_factory: pytest.TempPathFact
     return store
 
 
-def shares(frames: torch.Tensor, place: int) -> list[float]:
-    return [float(p) for p in softmax(frames[:, 3 * place : 3 * place + 3].numpy(), axis=1).mean(0)]
+def shares(frames: torch.Tensor, place: int) -> tuple[float, ...]:
+    return tuple(softmax(frames[:, 3 * place : 3 * place + 3].numpy(), axis=1).mean(0).tolist())
 
 
 def test_comparisons_stay_that_follow_from_the_logits_by_rule(
     questions: list[Question], logits: dict[str, torch.Tensor], store: EmbeddingStore
 ) -> None:
     said = [
-        Classification(
-            video_id=video,
-            object_id=video.rpartition("_")[0],
-            part=Part.TRAIN,
-            property=prop.name,
-            expected=0,
-            predicted=max(range(3), key=shares(frames, place).__getitem__),
-            probabilities=tuple(shares(frames, place)),
-        )
+        classified(video, prop.name, 0, int(np.argmax(own := shares(frames, place))), own)
         for video, frames in logits.items()
         for place, prop in enumerate(CATALOGUE.properties)
     ]

@@ -33,17 +33,9 @@ def score(
 ) -> dict[str, Any]:
     """A row of scores.csv: half of 40 answers right, a tenth unread; `variant` is encoder, lora and opd."""
     named = dict(zip(("encoder", "lora", "opd"), variant.split(" "), strict=True))
-    figures = {
-        "n": 40,
-        "sets": 9,
-        "right": 20.0,
-        "unread": 4.0,
-        "accuracy": 0.5,
-        "low": 0.35,
-        "high": 0.65,
-        "chance": 1 / 3,
-    }
-    return {"task": task, "measure": measure, **named, "touch": "real", "seed": "all", **figures, **other}
+    counts = {"n": 40, "sets": 9, "right": 20.0, "unread": 4.0}
+    figures = {"accuracy": 0.5, "low": 0.35, "high": 0.65, "chance": 1 / 3}
+    return {"task": task, "measure": measure, **named, "touch": "real", "seed": "all", **counts, **figures, **other}
 
 
 def effect(part: str = "lora", change: str = "with - without", **other: Any) -> dict[str, Any]:
