@@ -40,14 +40,8 @@ HUNG = 600.0
 """Seconds after which a test may take something for hung, however busy the machine is; nothing is measured by them."""
 
 # A loaded machine is no reason to fail, and a test that passes today passes tomorrow.
-settings.register_profile(
-    "house",
-    deadline=None,
-    derandomize=True,
-    database=None,
-    max_examples=60,
-    suppress_health_check=[HealthCheck.too_slow],
-)
+SAME = {"deadline": None, "derandomize": True, "database": None}
+settings.register_profile("house", **SAME, max_examples=60, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("house")
 
 

@@ -8,16 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from pipeline.core.io import (
-    atomic,
-    load_tensors,
-    read_json,
-    read_jsonl,
-    read_table,
-    write_json,
-    write_jsonl,
-    write_table,
-)
+from pipeline.core import io
+from pipeline.core.io import atomic, read_json, read_jsonl, read_table, write_json, write_jsonl, write_table
 from pipeline.core.records import Measurement, Part
 from pipeline.core.runtime import name_dtype, resolve_dtype
 from pipeline.tasks.records import Score
@@ -62,7 +54,7 @@ def test_bad_files_are_named_with_the_mend(tmp_path: Path) -> None:
     for words, read in (
         ("t.parquet.*columns", lambda: read_table(tmp_path / "t.parquet", Video)),
         ("q.jsonl.*line 2", lambda: read_jsonl(tmp_path / "q.jsonl", Score)),
-        ("x.safetensors.*not a safetensors file", lambda: load_tensors(tmp_path / "x.safetensors")),
+        ("x.safetensors.*not a safetensors file", lambda: io.load_tensors(tmp_path / "x.safetensors")),
     ):
         with refused(words):
             read()

@@ -29,7 +29,7 @@ FRAMES, DIM = 2, 6
 CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
 
 
-def write_store(folder: Path, frames: Sequence[tuple[str, int, str]], tensor: torch.Tensor) -> EmbeddingStore:
+def stored(folder: Path, frames: Sequence[tuple[str, int, str]], tensor: torch.Tensor) -> EmbeddingStore:
     """Embeddings of these frames: their videos, their places and how they are flipped."""
     index = [Embedding(video_id=v, frame_index=f, flip=flip, row=row) for row, (v, f, flip) in enumerate(frames)]
     write_table(folder / INDEX_FILE, Embedding, index)
@@ -120,7 +120,7 @@ def store(tmp_path_factory: pytest.TempPathFactory, questions: list[Question]) -
     folder = tmp_path_factory.mktemp("embeddings")
     videos = sorted({v for q in questions for v in q.videos})
     frames = [(v, f, flip) for v in videos for flip in FLIPS for f in range(3)]
-    return write_store(folder, frames, torch.randn(len(frames), DIM, generator=torch.manual_seed(0)))
+    return stored(folder, frames, torch.randn(len(frames), DIM, generator=torch.manual_seed(0)))
 
 
 @pytest.fixture(scope="session")

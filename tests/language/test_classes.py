@@ -13,7 +13,7 @@ from pipeline.language.classes import uncontradicted
 from pipeline.tasks.questions import build_questions
 from pipeline.training.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
 from tests.conftest import classified
-from tests.language.conftest import write_store
+from tests.language.conftest import stored
 from tests.tasks.shared import CATALOGUE, POOL
 
 ASKED = {"OPD": 20, "PC": 60, "PSS": 60, "POM": 90}
@@ -41,7 +41,7 @@ def store(logits: dict[str, torch.Tensor], tmp_path_factory: pytest.TempPathFact
     folder = tmp_path_factory.mktemp("logits")
     frames = [(video, frame, "none") for video in logits for frame in range(3)]
     mean, scale = torch.linspace(-4, 4, 9).double(), torch.linspace(0.2, 5, 9).double()
-    store = write_store(folder, frames, ((torch.cat([*logits.values()]) - mean) / scale).float())
+    store = stored(folder, frames, ((torch.cat([*logits.values()]) - mean) / scale).float())
     Statistics(mean, scale).save(folder / STATISTICS_FILE)
     return store
 

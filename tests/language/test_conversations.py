@@ -26,7 +26,7 @@ from pipeline.language.training import Material, assemble
 from pipeline.training.embeddings import EmbeddingStore
 from tests.checkpoints import write_llama
 from tests.conftest import refused
-from tests.language.conftest import CATALOGUE, DIM, FRAMES, generation, taking, write_store
+from tests.language.conftest import CATALOGUE, DIM, FRAMES, generation, stored, taking
 
 
 def test_without_a_begin_token_all_else_is_the_same(held: Material) -> None:
@@ -122,7 +122,7 @@ def test_frames_read_like_the_words_of_their_classes(
     labels = {v: label for q in questions for v, label in zip(q.videos, q.gold.labels, strict=True)}
     drawn = torch.Generator().manual_seed(0)
     frames = [(v, f, "none") for v in sorted(labels) for f in range(3)]
-    store = write_store(tmp_path, frames, torch.stack([felt(labels[v], drawn) for v, _, _ in frames]))
+    store = stored(tmp_path, frames, torch.stack([felt(labels[v], drawn) for v, _, _ in frames]))
     language = held.language.model_copy(update={"normalize_touch": bool(normalize), "weights": base})
     monkeypatch.setattr("pipeline.language.begin.STEPS", 250)
     model, data = assemble(replace(held, language=language, store=store), taking(14), "test")

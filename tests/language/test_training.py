@@ -37,9 +37,9 @@ from tests.language.conftest import (
     assert_comes_back,
     embedded,
     material,
+    stored,
     taking,
     train,
-    write_store,
 )
 
 CPU = RuntimeConfig(device="cpu")
@@ -163,7 +163,7 @@ def test_training_goes_on_from_a_trained_model(held: Material, checkpoints: Path
     after = {name for name, value in model.named_parameters() if not torch.equal(before[name], value)}
     assert {name for name in before if "lora_" in name} <= after
     assert not {name for name in after if name.startswith("llm") and "lora_" not in name}
-    other = replace(went_on, store=write_store(tmp_path / "other", [("a_0", 0, "none")], torch.zeros(1, DIM + 1)))
+    other = replace(went_on, store=stored(tmp_path / "other", [("a_0", 0, "none")], torch.zeros(1, DIM + 1)))
     with refused(f"begun reads embeddings of {DIM}, but the encoder gives {DIM + 1}; set encoder.backbone"):
         assemble(other, CONFIG, "align")
 

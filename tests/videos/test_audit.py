@@ -25,20 +25,7 @@ from pipeline.videos.audit.run import audit_chain, audit_folder, check_folder
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.records import Assignment, Finding, Probe, Video
 from tests import audit_records as made
-from tests.audit_records import (
-    ERROR,
-    GOOD_SPLIT,
-    INFO,
-    OBJECTS,
-    OTHER,
-    WARNING,
-    assigned,
-    leaks,
-    odd,
-    of,
-    probe,
-    probes,
-)
+from tests.audit_records import ERROR, GOOD_SPLIT, INFO, OBJECTS, OTHER, WARNING, assigned, odd, of, probe, probes
 from tests.closure import ROOT
 from tests.conftest import moving_square, write_video
 
@@ -180,7 +167,7 @@ def test_flawless_videos_no_videos_and_a_single_one_give_no_warning() -> None:
     assert odd(check_files(probes(), OTHER)) == []
     assert [*check_files([], OTHER), *check_leakage([], [], OTHER)] == []
     alone = Catalogue(language=OTHER.language, objects={"rug": OTHER.objects["rug"]})
-    assert odd(check_files([probe()], alone)) == odd(leaks([probe()], {}, alone)) == []
+    assert odd(check_files([probe()], alone)) == odd(made.leaks([probe()], {}, alone)) == []
 
 
 @pytest.mark.parametrize(

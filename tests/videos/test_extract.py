@@ -28,20 +28,9 @@ from pipeline.videos.frames.reference import reference_indices
 from pipeline.videos.frames.scan import Scan, scan
 from pipeline.videos.frames.selection import kept_count
 from pipeline.videos.records import Finding, Frame, Probe
+from tests import frame_rules
 from tests.conftest import encode, moving_square, not_utf8, refused, write_video
-from tests.frame_rules import (
-    CONFIG,
-    FILES,
-    Place,
-    constant,
-    frames_of,
-    luma,
-    pressing,
-    promising,
-    published,
-    salience,
-    scanned,
-)
+from tests.frame_rules import CONFIG, FILES, Place, constant, frames_of, luma, pressing, promising, salience, scanned
 
 NAMES = ["baseball_0", "baseball_1", "baseball_10", "potato_0", "potato_2", "rug_0", "rug_1"]
 """The videos of `tiny_videos`, sorted by object and number."""
@@ -201,7 +190,7 @@ def test_short_videos_are_left_out_by_the_published_rule(place: Place, caplog: p
     assert len([r for r in caplog.records if "too few" in r.message]) == 5
     for video in found.videos:
         own = [(f.frame_index, int(f.score)) for f in found.frames if f.video_id == video.video_id]
-        assert own == published(place.folder / video.path, video.frames)
+        assert own == frame_rules.published(place.folder / video.path, video.frames)
     assert len(np.load(place.out / "references.npy")) == 2
 
 

@@ -14,20 +14,9 @@ from pipeline.use.frames import read_touch
 from pipeline.videos.decoding import Decoder, fit, picture, planes
 from pipeline.videos.frames import selection
 from pipeline.videos.frames.reference import reference_indices, thumbnail
+from tests import frame_rules
 from tests.conftest import encode, moving_square, write_video
-from tests.frame_rules import (
-    CONFIG,
-    Scanned,
-    constant,
-    frames_of,
-    luma,
-    pillow,
-    pressing,
-    promising,
-    published,
-    salience,
-    scanned,
-)
+from tests.frame_rules import CONFIG, Scanned, constant, frames_of, luma, pressing, published, salience, scanned
 
 WIDTH, HEIGHT = 120, 90
 
@@ -208,7 +197,7 @@ def test_the_published_rule(tmp_path: Path, count: int) -> None:
     for make in (moving_square, pressing, constant):
         path = write_video(tmp_path / "v.avi", make(count))
         for promised in (max(1, count - 14), count, count + 7):
-            with promising(promised):
+            with frame_rules.promising(promised):
                 found = scanned(path, FramesConfig(pixels=16, selection="release"))
             assert chosen(found) == published(path, promised)
             assert_fitted(path, found)
@@ -238,5 +227,5 @@ def test_real_frames(real_data: Path, name: str) -> None:
     promised = Decoder(path).header.frames
     assert chosen(scanned(path, FramesConfig(pixels=64, selection="release"))) == published(path, promised)
     for frame in frames_of(path)[::40]:
-        expected = pillow(picture(frame)[..., ::-1], 64, "crop").astype(int)
+        expected = frame_rules.pillow(picture(frame)[..., ::-1], 64, "crop").astype(int)
         assert np.abs(fit(frame, FramesConfig(pixels=64)).astype(int) - expected).mean() < 1.5
