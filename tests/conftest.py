@@ -271,16 +271,11 @@ def few_permutations(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def classified(
-    video_id: str,
-    name: str,
-    expected: int,
-    predicted: int,
-    probabilities: tuple[float, ...] = (1.0,),
-    part: Part = Part.TEST,
+    video_id: str, name: str, expected: int, predicted: int, shares: Sequence[float] = (1.0,), part: Part = Part.TEST
 ) -> Classification:
     """What a head said of a video, which is called after its object."""
     whose = {"video_id": video_id, "object_id": video_id.rpartition("_")[0], "part": part, "property": name}
-    return Classification(**whose, expected=expected, predicted=predicted, probabilities=probabilities)
+    return Classification(**whose, expected=expected, predicted=predicted, probabilities=tuple(shares))
 
 
 def fake_videos(objects: Iterable[str], per_object: int = 3) -> list[Video]:

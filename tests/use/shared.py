@@ -139,11 +139,7 @@ def make(where: Path, variant: Variant, *overrides: str) -> Made:
 
 
 def replay(
-    model: Octopi,
-    questions: Sequence[Question],
-    predictions: Sequence[Prediction],
-    opd: Opd,
-    files: Mapping[str, Path],
+    model: Octopi, questions: Sequence[Question], predictions: Sequence[Prediction], opd: Opd, files: Mapping[str, Path]
 ) -> int:
     """Ask the evaluation's questions turn by turn, from the files, and count them: answers must be the stored ones."""
     asked = {q.question_id: q for q in questions}

@@ -209,13 +209,7 @@ SAYS = (
 
 @pytest.mark.parametrize(("each", "question", "shown", "same", "other"), SAYS)
 def test_what_the_heads_say_stands_beside_an_answer(
-    each: list[tuple[int, tuple[float, ...]]],
-    question: str,
-    shown: str | None,
-    same: str,
-    other: str,
-    octopi: Octopi,
-    monkeypatch: pytest.MonkeyPatch,
+    each: Any, question: str, shown: str | None, same: str, other: str, octopi: Octopi, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = {str(n): Classified((p, ONE, TWO), (level, 2, 2)) for n, (level, p) in enumerate(each)}
     monkeypatch.setattr(octopi.encoder, "classify", found.__getitem__)
