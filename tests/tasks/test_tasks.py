@@ -185,9 +185,11 @@ UNREAD = {
         a) is the same as b).
         The hardest is **a)** or **b)**.
         Answer: A human cannot tell.
+        Conclusion: a), b) or c)
         Conclusion: a) is soft, b) is hard, c) is hard.
         Conclusion: a b)
         a. The surface feels hard.
+        Conclusion: **a)**. Answer: **b)**.
         Answer: b) Conclusion: I cannot tell.
         None of **b)**
         """,
@@ -218,10 +220,12 @@ READ = {
         Conclusion: **b)** is the hardest.
         Option B is the hardest.
         Answer: b
+        The hardest object is b).
         B.
         \\boxed{b}
         **Conclusion:** b), because a) is soft
         b is clearly the hardest
+        Final answer - B
         The most bumpy one is **b**.
         Conclusion: \\(b\\)
         \N{FULLWIDTH LATIN SMALL LETTER B}) is the hardest
@@ -230,11 +234,13 @@ READ = {
         The most suitable object is (b), because a) is soft.
         The most suitable object for cleaning a pan without scratching it is b).
         b) is the best choice.
+        Option B
         The most suitable object is: b)
         the most suitable object is Object b
         """,
     ("RIPE", "b"): """
         The riper avocado is **b)**.
+        Thus b) is riper.
         The Riper Avocado is (B).
         a) is hard, so the riper one is b).
         """,
@@ -275,6 +281,7 @@ PLAIN = ("a lanyard's card holder", "a baseball", "a lemon")
         (PLAIN, "a) is {a}, a) is {a}, b) is {b} and c) is {c}.", None),
         (PLAIN, "{a}, {b}, {c}", None),
         (PLAIN, "a) is not {a}, b) is {b} and c) is {c}.", None),
+        (PLAIN, "a) {a} or {b}, b) {b}, c) {c}", None),
         (PLAIN, "a) is {a}, b) or c) is {c}", None),
         (("a lanyard", "a tomato", "a potato"), "a) is {a}, b) is {b} and c) is {c}.", True),
         (("a lanyard", "a tomato", "a potato"), "a) is a lanyard's card holder, b) is {b} and c) is {c}.", None),

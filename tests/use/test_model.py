@@ -193,13 +193,8 @@ OVERALL = "Overall, it presents a {} and rough surface with big bumps."
 SAYS = (
     # Class and probabilities of each video's hardness, a question, what follows; an answer that says it, and another.
     ([(0, ONE), (1, TWO)], "Which is softer?", "0.40.*1.00.*first object is softer", "So the first one.", "Both."),
-    (
-        [(1, ONE), (1, TWO)],
-        "Which is harder?",
-        "0.40.*1.00.*Both objects are similar",
-        "Both.",
-        "The second is harder.",
-    ),
+    ([(0, ONE), (1, TWO)], "Is {tactile} harder than {tactile}?", "second object is harder", "No, it is not.", "Both."),
+    ([(1, ONE), (1, TWO)], "Which is harder?", "0.40.*1.00.*Both objects are similar", "Both.", "The second is."),
     ([(0, ONE), (1, TWO), (1, ONE)], "Which is the hardest?", r"b\) is the hardest", "b) is the hardest.", "c)"),
     ([(0, TWO)], "How does it feel?", r"soft \(20%\)", OVERALL.format("soft"), OVERALL.format("hard")),
     ([(0, TWO)], "Is it softer?", None, "Yes.", "No."),
