@@ -48,7 +48,6 @@ def probes(videos: int = 3, objects: Sequence[str] = OBJECTS) -> list[Probe]:
 
 
 def assigned(found: Sequence[Probe], parts: dict[str, Part]) -> list[Assignment]:
-    """Parts by video id, else by object."""
     return [
         Assignment(
             video_id=p.video_id, object_id=p.object_id, part=parts.get(p.video_id, parts.get(p.object_id, Part.UNUSED))

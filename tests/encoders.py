@@ -104,7 +104,6 @@ def float64(tensor: torch.Tensor) -> Floats:
 
 
 def close(found: torch.Tensor, expected: Floats, rtol: float = 1e-5) -> None:
-    """Within float32's rounding, for the array as a whole."""
     assert found.dtype == torch.float32
     np.testing.assert_allclose(float64(found), expected, rtol=0, atol=rtol * max(1, np.abs(expected).max()))
 

@@ -63,8 +63,6 @@ def frames_of(path: Path) -> list[av.VideoFrame]:
 
 
 class Scanned(NamedTuple):
-    """What is kept of a video, and what is measured of it."""
-
     kept: tuple[Kept, ...]
     reference: np.ndarray
     probe: Probe

@@ -143,7 +143,6 @@ def test_encoders_are_the_tower_with_prompts(
 
 
 def test_the_class_token_is_read_where_it_is_named(frames: torch.Tensor, tmp_path: Path) -> None:
-    """By `paper`, normalised; `release` reads it whatever is named."""
     weights, pictures, indices = write_tower(tmp_path), frames[:, 0], FRAME_INDICES[:, 0]
     tower, encoder = Tower(weights), base_encoder(config(weights, "paper", embedding="class_token"))
     assert encoder.dim == 32

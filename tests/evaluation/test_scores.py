@@ -121,7 +121,6 @@ def test_effects_are_the_full_system_less_one_part() -> None:
 
 
 def test_training_is_compared_with_the_most_ratings() -> None:
-    """On the same questions; with the language model that was adapted, not with its heads and rules."""
     full, few, most, rules = drawn(), drawn(), drawn(), drawn()
     own = set(Score.model_fields)
     ways = ((few, 3, Shown.TOUCH), (most, 20, Shown.TOUCH), (rules, 20, Shown.CLASSES))

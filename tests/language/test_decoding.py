@@ -130,7 +130,6 @@ def test_loss_and_gradients_are_those_of_all_at_once(language: LanguageConfig, t
 
 
 def test_what_all_rows_begin_with_is_read_for_one(language: LanguageConfig, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the places that the model's layers are given, in training and in answering."""
     model = OctopiForCausalLM.from_base(language.weights, DIM).eval()
     places: list[int] = []
     model.llm.model.layers[0].mlp.register_forward_pre_hook(lambda _, given: places.append(given[0][..., 0].numel()))

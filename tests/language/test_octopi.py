@@ -47,7 +47,6 @@ def test_normalized_touch_is_as_long_as_words(kind: str, tmp_path: Path) -> None
 
 
 def trained(model: OctopiForCausalLM) -> OctopiForCausalLM:
-    """With an adapter that changes something, and a connector that no seed draws."""
     for parameter in model.connector.parameters():
         torch.nn.init.normal_(parameter, std=0.1)
     return adapted(model)

@@ -103,7 +103,6 @@ def test_killed_and_resumed_ends_the_same(kind: str, when: str, left: int, held:
 
 
 def test_a_checkpoint_s_key_has_each_input(held: Material, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A checkpoint holds only what is trained: gone on with on other inputs, it would be neither's."""
     monkeypatch.chdir(tmp_path)
     weights, catalogue = tmp_path / "weights", tmp_path / "catalogue"
     embeddings, asked = embeddings_dir(Encoder.FINETUNED, 0), questions_file(0, "train")

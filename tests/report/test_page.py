@@ -184,7 +184,6 @@ def test_what_is_missing_is_said_with_the_reason(changed: Path, monkeypatch: pyt
     ],
 )
 def test_what_only_users_can_measure_is_missing_until_they_have(said: dict[str, str], covered: set[str]) -> None:
-    """Not by synthetic fruit, nor by photos of other objects."""
     cells = {key: said[key] for key in ("task", "touch") if key in said}
     about = {"source": "videos", "dataset": "avocados", **{k: v for k, v in said.items() if k not in cells}}
     left = {what for _, what, _ in left_to_users([report([score(**cells)], **about)])}

@@ -250,7 +250,6 @@ def test_only_what_is_significant_and_above_chance_holds_up(effects: list[dict[s
 
 @pytest.mark.parametrize("part", ["language", "encoder"])
 def test_random_base_models_are_said_to_be_chance_first(part: str) -> None:
-    """By what the models are, whatever the scale is called."""
     said = report([score()])
     random = {"data/weights/tiny-llama": True, "data/weights/smollm2": False, "elsewhere/data/weights/tiny-clip": False}
     for folder, known in random.items():

@@ -158,7 +158,6 @@ def test_classes_are_restated_before_a_conclusion() -> None:
 
 
 def test_some_comparisons_are_asked_as_people_do() -> None:
-    """The videos stand before the question or behind it; the answer names what has more of the property."""
     changed = reworded({"OPD": 4, "PC": 90, "PSS": 9, "POM": 6}, plainly=0.5)
     assert {q.task for q, _ in changed} == {"PC"}
     assert 30 < len(changed) < 60

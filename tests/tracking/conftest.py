@@ -62,7 +62,6 @@ class FakeChain:
     folder: Path
 
     def copy(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeChain]:
-        """Copy it, and make that the working directory of a process that tracks."""
         shutil.copytree(self.folder, folder)
         monkeypatch.chdir(folder)
         out_of_reach.clear()

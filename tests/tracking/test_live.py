@@ -61,7 +61,6 @@ class Line(nn.Module):
 
 
 def fit(params: Params, callbacks: Sequence[Any]) -> Trained:
-    """Some steps on made-up points; the same whenever it is called."""
     torch.manual_seed(0)
     data = [{"inputs": torch.tensor([i, 1.0]), "labels": torch.tensor(2.0 * i)} for i in range(8)]
     arguments = training_arguments(Path("fit"), params.runtime, 0, params.pretrain, max_steps=STEPS, logging_steps=1)

@@ -145,7 +145,6 @@ def test_what_cannot_be_adapted(octopi: Octopi, catalogue: Catalogue, tmp_path: 
 def test_heads_of_another_recipe_stay(
     made: Made, files: list[Path], catalogue: Catalogue, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """And a video in which nothing is touched is left out, with a line."""
     model = Octopi.from_pretrained(made.folder, device="cpu")
     with refused("heads are read anew where it has been fine-tuned with encoder.recipe=tuned"):
         adapt(model, files, tmp_path / "mine", catalogue=catalogue, objects=["rug", "pillow"])

@@ -178,7 +178,6 @@ def test_an_unknown_property_loads_no_model(made: Made, files: list[Path], monke
 def test_described_compared_ranked_and_matched_by_command(
     by_command: Command, octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each as the call of the same name, and what makes one doubt it on stderr, once."""
     monkeypatch.setattr(octopi, "doubts", ("no answer means anything",))
 
     def said(*words: object) -> str:

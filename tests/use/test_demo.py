@@ -168,7 +168,6 @@ def test_old_touches_are_forgotten(tmp_path: Path, catalogue: Catalogue) -> None
 
 
 def test_a_trained_model_is_shown_and_asked(octopi: Octopi, files: list[Path], catalogue: Catalogue) -> None:
-    """The class itself, of random weights: what the page is given is what it says by itself."""
     session = Session(octopi, catalogue, {})
     shown = asyncio.run(session.work(lambda: session.show("ice block", files[0])))
     described = octopi.describe(files[0])

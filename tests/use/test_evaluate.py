@@ -134,7 +134,6 @@ def octopi(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Octopi]:
 def test_it_tells_touches_apart_from_any_folder(
     octopi: Octopi, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """As a newcomer types it, and the other way round; and which of three is what."""
     soft, hard, rough = (EXAMPLES / f"{name}.mp4" for name in ("soft", "hard", "rough"))
     assert max(f.stat().st_size for f in EXAMPLES.glob("*.mp4")) <= VIDEO
     question = "Which is softer? {tactile} {tactile}"

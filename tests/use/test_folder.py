@@ -27,7 +27,6 @@ from tests.use.shared import PARTS, Made
 
 @pytest.fixture
 def copy(made: Made, tmp_path: Path) -> Path:
-    """A copy of the folder, far from its language model."""
     return Path(shutil.copytree(made.folder, tmp_path / "copy"))
 
 
@@ -66,7 +65,6 @@ def test_equal_inputs_give_equal_folders(made: Made, tmp_path: Path, monkeypatch
 
 
 def test_the_stage_packages_what_is_asked_for(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each folder holds the whole encoder, and the chain trains eight variants."""
     shutil.copytree(made.folder.parents[1], tmp_path, dirs_exist_ok=True)
     shutil.rmtree(tmp_path / "models")
     for trained in (tmp_path / "data" / "models").iterdir():

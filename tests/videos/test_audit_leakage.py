@@ -222,7 +222,6 @@ def test_constant_features_are_no_division_by_zero() -> None:
 
 @pytest.mark.parametrize(("sample", "leak"), [(leakage.SAMPLE, 1.0), (leakage.SAMPLE, 0.0), (50, 1.0)])
 def test_a_picture_that_tells_the_label_is_a_warning(monkeypatch: pytest.MonkeyPatch, sample: int, leak: float) -> None:
-    """Where untouched pictures depend on the object's hardness; also where few of very many videos are predicted."""
     monkeypatch.setattr(leakage, "PERMUTATIONS", 200)
     monkeypatch.setattr(leakage, "SAMPLE", sample)
     rng = np.random.default_rng(0)
