@@ -50,9 +50,7 @@ def test_without_a_begin_token_all_else_is_the_same(held: Material) -> None:
     st.sampled_from([1, 2, 4]),
     st.integers(0, 3),
 )
-def test_updates_are_equal_on_any_devices(
-    lengths: list[int], micro: int, rounds: int, devices: int, epoch: int
-) -> None:
+def test_updates_are_equal_on_any_device(lengths: list[int], micro: int, rounds: int, devices: int, epoch: int) -> None:
     """Those of a random order, as accelerate deals them; in a last update that is too small fillers take part."""
     update = micro * rounds * devices
     data = SimpleNamespace(lengths=lengths, epoch=epoch)

@@ -31,7 +31,7 @@ def build(key: str, *rows: dict[str, object], dataset: str = load.DATASET) -> pd
     return BY_KEY[key].build(report(rows, dataset=dataset))
 
 
-def test_all_of_the_papers_combinations_stand_beside_the_ratings(catalogue: Catalogue) -> None:
+def test_the_papers_combinations_and_annotations(catalogue: Catalogue) -> None:
     """Also those that no object has by its ratings: the paper's counts add up to its 74 objects."""
     rows = dataset_frame(catalogue, [], []).set_index("table").loc["property_combinations"]
     assert (len(rows), rows["objects"].sum(), rows["published"].sum()) == (27, 74, 74)
@@ -40,9 +40,6 @@ def test_all_of_the_papers_combinations_stand_beside_the_ratings(catalogue: Cata
     other = catalogue.model_copy(update={"language": catalogue.language.model_copy(update={"dataset": "another"})})
     own = dataset_frame(other, [], []).set_index("table").loc["property_combinations"]
     assert own["objects"].min() > 0, "of four properties of five classes there would be 625"
-
-
-def test_the_papers_videos_give_its_annotations(catalogue: Catalogue) -> None:
     numbers = zip(catalogue.objects, [5] * 42 + [6] * 26 + [7] * 6, strict=True)
     videos = [video for o, number in numbers for video in fake_videos([o], number)]
     rows = dataset_frame(catalogue, videos, []).set_index(["table", "row"])
@@ -169,9 +166,7 @@ def test_reports_about_other_data_stand_beside_what_is_published_of_these() -> N
 
 
 @pytest.mark.parametrize("dataset", load.DATASETS)
-def test_published_keys_are_unique_percentages_of_their_n_and_of_registered_tasks(
-    catalogue: Catalogue, dataset: str
-) -> None:
+def test_published_keys_are_unique_percentages_of_n_and_of_registered_tasks(catalogue: Catalogue, dataset: str) -> None:
     cells = published(dataset)
     assert not cells.duplicated([*KEYS, "model"]).any()
     answered = cells[cells["model"].isin(["7b", "13b", "CLIP"])]

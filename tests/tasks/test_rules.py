@@ -200,14 +200,11 @@ COMPARED = {
 """An answer, and whether it is right by rules and by the published comparison."""
 
 
-def test_a_comparison_is_read_and_compared() -> None:
+def test_what_is_read_and_what_is_compared() -> None:
     questions = build_questions(POOL, {"PC": 60}, seed=1, distinct=True)
     question = next(q for q in questions if q.dialogues[0].turns[-1].assistant == VERDICT)
     scores = {said: graded(question, said)["choice"] for said in COMPARED}
     assert {said: (score.correct, score.strict) for said, score in scores.items()} == COMPARED
-
-
-def test_a_matching_in_another_order_is_read_but_not_compared() -> None:
     question = random.Random(0).choice(EACH_TASK["POM"])
     a, b, c = (CATALOGUE.objects[o].name for o in question.objects)
     score = graded(question, f"Conclusion: b) is {b}, a) is {a} and c) is {c}.")["choice"]

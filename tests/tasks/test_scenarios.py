@@ -116,9 +116,6 @@ def test_pairs_have_two_ranks_and_the_softer_one_is_riper() -> None:
             assert len(dialogue.turns) == turns
             assert dialogue.turns[0].user == TALK
             assert [turn.user.count("{tactile}") for turn in dialogue.turns] == [0, 2, 0][:turns]
-
-
-def test_the_public_data_sets_two_avocados_are_a_pair() -> None:
     questions = pairs(WHOLE, ["avocado_unripe", "avocado_kinda_ripe", "rug", "lemon"], 20)
     assert {frozenset(q.objects) for q in questions} == {frozenset({"avocado_unripe", "avocado_kinda_ripe"})}
     assert all(q.objects["ab".index(q.gold.choice)] == "avocado_kinda_ripe" for q in questions)
@@ -160,7 +157,7 @@ def about(**parts: Part) -> dict[str, Question]:
     return {q.question_id: q for q in build_examples(split, CATALOGUE, seed=0)}
 
 
-def test_each_is_asked_in_both_orders_about_its_own_objects() -> None:
+def test_an_example_is_asked_in_both_orders_where_its_objects_have_videos() -> None:
     found = about(rice=Part.VALIDATION, toothbrush_handle=Part.TEST, toothbrush_bristles=Part.TRAIN, baseball=Part.TEST)
     assert list(found) == ["rice-a", "rice-b", "toothbrush-a", "toothbrush-b"]
     assert found["rice-a"].part == Part.VALIDATION
@@ -177,9 +174,6 @@ def test_each_is_asked_in_both_orders_about_its_own_objects() -> None:
         place = brush.dialogues[0].turns[0].assistant.split("b) ")["ab".index(letter)]
         assert "presents a hard and smooth surface with small bumps" in place, "the handle's rating in the paper"
     assert not {q.task for q in found.values()} & TASKS.keys(), "no figure counts them"
-
-
-def test_without_videos_of_all_its_objects_an_example_is_not_asked() -> None:
     assert about(toothbrush_handle=Part.TEST, rice=Part.UNUSED) == {}
     assert list(about(toothbrush_handle=Part.TEST, rice=Part.TEST)) == ["rice-a", "rice-b"]
 

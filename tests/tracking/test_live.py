@@ -177,9 +177,7 @@ def test_an_unfinished_reproduction_of_another_scale_ends(chain: FakeChain) -> N
 
 
 @pytest.mark.parametrize(("on", "rank"), [(False, "0"), (True, "1")])
-def test_mlflow_is_not_imported_without_live_logging_or_in_a_second_process(
-    chain: FakeChain, on: bool, rank: str
-) -> None:
+def test_mlflow_is_not_imported_without_logging_or_in_a_second_process(chain: FakeChain, on: bool, rank: str) -> None:
     shutil.rmtree("mlruns")
     write_params(watched(chain.params, live=on))
     code = (

@@ -94,7 +94,7 @@ def test_an_answer_streams_with_its_history(site: str, session: Session, tmp_pat
     model.gate = None
 
 
-def test_an_answer_that_nobody_hears_ends(site: str, session: Session) -> None:
+def test_an_answer_that_nobody_hears_ends_and_one_that_breaks_off_says_so(site: str, session: Session) -> None:
     model: Any = session.model
     model.seconds = 0.01
     with httpx2.stream("POST", f"{site}/api/ask", json={"question": "endless"}, timeout=HUNG) as response:
@@ -103,6 +103,7 @@ def test_an_answer_that_nobody_hears_ends(site: str, session: Session) -> None:
     time.sleep(0.05)
     assert model.made == made
     model.seconds = 0.0
+    assert said(session, question="crash") == f"crash \n[{Failed()}]"
 
 
 def said(session: Session, **asked: Any) -> str:
@@ -110,10 +111,6 @@ def said(session: Session, **asked: Any) -> str:
         return "".join([piece async for piece in await session.stream(Asked(**asked))]).split(ASIDE)[0]
 
     return asyncio.run(whole())
-
-
-def test_an_answer_that_breaks_off_says_so(session: Session) -> None:
-    assert said(session, question="crash") == f"crash \n[{Failed()}]"
 
 
 def test_what_is_wrong_comes_back_as_one_line(site: str, tmp_path: Path) -> None:

@@ -149,9 +149,7 @@ def test_it_tells_touches_apart_from_any_folder(
 
 
 @pytest.mark.slow
-def test_a_runs_videos_are_asked_about_both_ways(
-    octopi: Octopi, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_runs_videos_are_asked_about_twice(octopi: Octopi, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What it says of them is what it says to a person who asks; an object that it was trained on stops the stage."""
     changed = ["data.source=videos", f"data.dir={EXAMPLES}", f"data.catalogue={ROOT}/pipeline/physiclear"]
     few = [

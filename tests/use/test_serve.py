@@ -176,9 +176,7 @@ BAD: list[tuple[bytes | dict[str, Any], int, str]] = [
 
 
 @pytest.mark.parametrize(("bad", "status", "words"), BAD)
-def test_bad_requests_leave_their_place(
-    client: TestClient, bad: bytes | dict[str, Any], status: int, words: str
-) -> None:
+def test_bad_requests_keep_no_place(client: TestClient, bad: bytes | dict[str, Any], status: int, words: str) -> None:
     content = bad if isinstance(bad, bytes) else json.dumps(bad).encode()
     for _ in range(3):  # There are two places.
         response = client.post(CHAT, content=content, headers={"Content-Type": "application/json"})
@@ -186,15 +184,12 @@ def test_bad_requests_leave_their_place(
     assert client.get("/health").json()["waiting"] == 0
 
 
-def test_other_refusals(client: TestClient) -> None:
+def test_other_refusals_and_a_model_that_breaks(client: TestClient) -> None:
     error(client.get("/nowhere"), 404)
     error(client.get("/v1/models/gpt-4"), 404)
     error(client.get(CHAT), 405)
     error(client.post(CHAT, content=b"{}", headers={"Content-Type": "text/plain"}), 415)
     assert "octopi" in error(client.post(CHAT, json={**body(ASK), "model": "gpt-4"}), 404)
-
-
-def test_a_model_that_breaks_and_one_that_refuses_late(client: TestClient) -> None:
     for stream in (False, True):
         assert "the server's log says why" in error(client.post(CHAT, json=body(user("break"), stream=stream)), 500)
     assert client.post(CHAT, json=body(ASK)).status_code == 200

@@ -287,9 +287,6 @@ def test_missing_objects_are_reported_or_refused() -> None:
     assert not parts(present, name="paper")[Part.TEST]
     with refused(r"ice_block.*denim.*split\.missing"):
         parts(present, name="paper", missing="error")
-
-
-def test_a_split_that_tests_nothing_says_so() -> None:
     said = untested({"rug": Part.TRAIN, "denim": Part.TEST, "mug": Part.UNUSED}, {"rug", "mug", "new"})
     assert "1 of 1 test objects have no videos (denim)" in said
     assert "2 with videos are in no part (mug, new)" in said

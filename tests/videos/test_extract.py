@@ -173,9 +173,6 @@ def test_an_error_names_its_video_and_keeps_what_is_finished(place: Place) -> No
     place.decoded()
     assert len(place.extract().videos) == 7
     assert not {*NAMES[:4]} & {*place.decoded()}, "what stands before it is finished, and perhaps more"
-
-
-def test_names_that_are_no_text_are_named(place: Place) -> None:
     (place.folder / "rug_0.avi").rename(not_utf8(place.folder, "rug_?_0.avi"))
     with refused(r"rug_\\udcff_0\.avi: its name is no text in UTF-8; rename it"):
         place.extract()

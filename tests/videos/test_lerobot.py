@@ -89,9 +89,7 @@ def test_each_press_becomes_a_video(layout: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("options", ["keyint=250", "keyint=12:min-keyint=12:open-gop=1"])
 @pytest.mark.parametrize("codec", ["x264", "x265"])
-def test_episodes_without_a_keyframe(
-    codec: str, options: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_episodes_with_no_keyframe(codec: str, options: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     shutil.copytree(DATASETS / "touch_demo", root := tmp_path / "touch_demo")
     rows = pd.read_parquet(meta := root / "meta/episodes/chunk-000/file-000.parquet")
     rows.assign(**{f"videos/{WRIST}/from_timestamp": [0.0, 1.9999999, 4.8333333]}).to_parquet(meta)  # As sums may be.

