@@ -1,7 +1,5 @@
 """Made-up measurements and catalogues for the tests of the audit."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Tiny models in published layouts, ways to change their files, and the base models that are made once."""
 
-from __future__ import annotations
-
 import json
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What the tests of encoders share: tiny towers, frames as extraction leaves them, settings, comparisons."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What the stages before the report leave on disk, made up: real formats, small, a second of work."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Small videos, slow second implementations of the rules, and a place to extract frames to."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """The command `octopi`: what a person sees, and the exit status."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 from unittest.mock import Mock

@@ -1,7 +1,5 @@
 """Scales: each shipped one is valid, and a wrong value is named with its key and what is allowed."""
 
-from __future__ import annotations
-
 import shutil
 from contextlib import nullcontext
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Files that appear whole or not at all, records that come back as they went, and the number format `auto`."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What a person does with the folder: clone it on Windows, put it where a path has a space, move it."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import socket

@@ -1,7 +1,5 @@
 """Counted memory and disk against what torch keeps, the measured rehearsal, and published sizes."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from collections.abc import Callable, Iterable

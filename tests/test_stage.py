@@ -1,7 +1,5 @@
 """Around a stage: one line for bad input, one process at a time, and the code beside it or none."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -1,7 +1,5 @@
 """The table of costs and errors, the figures drawn from it, and every section in a reduced form, whole."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What several tests of encoders share."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Backbones: what they compute against timm's own features, what is tuned of them, and training above cached trunks."""
 
-from __future__ import annotations
-
 import json
 import sys
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What the recipes compute, against towers and heads that are written anew here, in float64."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Synthetic pictures: each follows from seed and number alone, says what is so of its object, and survives kills."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import os

@@ -1,7 +1,5 @@
 """Training of encoders, the clips that they are shown, what is saved of them, and the registry of recipes."""
 
-from __future__ import annotations
-
 import itertools
 import random
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,5 @@
 """Trainings of encoders that go wrong: classes that lack, NaN, rates that are too high, kills, too few objects."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import replace

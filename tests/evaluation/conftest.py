@@ -1,7 +1,5 @@
 """Made-up questions and answers that several tests of evaluation share."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 

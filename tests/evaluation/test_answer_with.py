@@ -1,7 +1,5 @@
 """`octopi answer-with` through OpenAI's client, in front of an endpoint that answers well, badly, or not at all."""
 
-from __future__ import annotations
-
 import functools
 import json
 import re

@@ -1,7 +1,5 @@
 """Temperatures and calibration errors against sums by hand; maps of embeddings keep what is near."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """`octopi diff` in a small Git and DVC repository: what it names, what it leaves out, and its paired test."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import re

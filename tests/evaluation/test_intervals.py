@@ -1,7 +1,5 @@
 """Intervals and paired comparisons: closed forms, brute force, scipy, statsmodels, quadrature, simulated coverage."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import random

@@ -1,7 +1,5 @@
 """Questions that others answer: what is exported, what is taken back, and what it says in a report."""
 
-from __future__ import annotations
-
 import json
 import runpy
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Pictures in place of tactile videos: the kept frames bit by bit, or photos of the object that was touched."""
 
-from __future__ import annotations
-
 import base64
 import io
 import re

@@ -1,7 +1,5 @@
 """The rows of scores.csv and effects.csv, from made-up answers that are counted by hand."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

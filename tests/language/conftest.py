@@ -1,7 +1,5 @@
 """What tests of the language side share: a tiny Llama, questions in real wording, embeddings of noise, references."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 The reference is transformers' own: the same format written with its `generation` blocks, whose tokens it marks.
 """
 
-from __future__ import annotations
-
 import io
 from contextlib import suppress
 from datetime import date

@@ -1,7 +1,5 @@
 """Classes read from logits, held against the rules as reports grade them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Conversations, of which only answers carry labels, batches that hold like lengths, and the projection's start."""
 
-from __future__ import annotations
-
 import random
 from dataclasses import replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Greedy decoding against transformers' own, row for row; answers by hand, at the limits of tokens and positions."""
 
-from __future__ import annotations
-
 import copy
 from pathlib import Path
 

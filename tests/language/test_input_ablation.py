@@ -1,7 +1,5 @@
 """Input ablations: no touch, another object's, noise; the same for every variant and batch."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

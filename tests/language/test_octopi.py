@@ -1,7 +1,5 @@
 """The model: embeddings in their places, the loss, and what is saved, loaded and refused."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -5,8 +5,6 @@ added in another order. Adam divides each gradient by its own size, so an update
 to the rate: 1e-7 times the terms that cancel, far below the hundredth of a rate that is allowed here.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Language trainings: what learns how fast, kills from which they resume to the bit, and rates that are too high."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import multiprocessing

@@ -1,7 +1,5 @@
 """A report that tests only read, small ones known by hand, those in Git, and the page as tests read it."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Sequence

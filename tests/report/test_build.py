@@ -1,7 +1,5 @@
 """A whole report from a made-up run: its files, its figures recomputed, runs that lack something, equal bytes."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

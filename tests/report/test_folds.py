@@ -1,7 +1,5 @@
 """Reports over folds: what is pooled, and what is said of missing folds, spoilt test objects and a taught base."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from pathlib import Path
 from statistics import fmean

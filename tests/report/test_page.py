@@ -1,7 +1,5 @@
 """The page over all reports: every figure on it is a cell of a file, it fetches nothing, and says what is missing."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

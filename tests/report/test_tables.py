@@ -1,7 +1,5 @@
 """The registry of tables, published figures in columns of their own, and each rule of what a README may claim."""
 
-from __future__ import annotations
-
 import itertools
 from pathlib import Path
 from types import SimpleNamespace

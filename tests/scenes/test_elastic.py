@@ -1,7 +1,5 @@
 """How surfaces sink, are pressed and turn: against closed solutions, direct integration and each other's limits."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

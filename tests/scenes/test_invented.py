@@ -1,7 +1,5 @@
 """Recipes, listed, drawn or refused; and the catalogue of invented objects, whose scenes measure as labelled."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from pathlib import Path

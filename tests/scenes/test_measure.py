@@ -1,7 +1,5 @@
 """Classes measured from scenes: of plain shapes whose classes are known, and of every object of the catalogue."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from statistics import fmean
 

@@ -1,7 +1,5 @@
 """Bodies and every layer of relief against what their formulas say, and against themselves on another grid."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

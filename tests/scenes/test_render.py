@@ -1,7 +1,5 @@
 """From recipes to videos: the hand's motion, what a press and a twist show, light on the gel, and the files."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

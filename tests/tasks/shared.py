@@ -1,7 +1,5 @@
 """What the tests of the tasks share: PhysiCLeAR's objects, and what grades an answer."""
 
-from __future__ import annotations
-
 import random
 from itertools import islice
 

@@ -1,7 +1,5 @@
 """The table of choices says what the code does, and what the paper's source does."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 from typing import Any

@@ -1,7 +1,5 @@
 """Question sets: seeded, distinct, balanced, and only about the videos of their part."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from collections import Counter, defaultdict

@@ -1,7 +1,5 @@
 """The registry: a task that is named there once is built, counted, graded and checked like the others."""
 
-from __future__ import annotations
-
 import sys
 from collections import Counter
 from pathlib import Path

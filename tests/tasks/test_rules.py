@@ -1,7 +1,5 @@
 """What follows from classes alone, against right answers and brute force; strict scores, as in the published code."""
 
-from __future__ import annotations
-
 import itertools
 import random
 import re

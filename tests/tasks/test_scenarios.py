@@ -1,7 +1,5 @@
 """Scenarios, pairs of unequal ripeness after the paper's question, and the paper's rice and toothbrush."""
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Every task grades its own answers as right and everything else as wrong or unread."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

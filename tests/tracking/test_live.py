@@ -1,7 +1,5 @@
 """Trainings that log while they run: their curves, their ends, and that nothing which tracking does reaches them."""
 
-from __future__ import annotations
-
 import inspect
 import multiprocessing
 import os

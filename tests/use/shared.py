@@ -1,7 +1,5 @@
 """The chain in small, by its libraries: videos, an encoder, a language model and their stored answers."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """A model's copy for another sensor, by videos alone and by rated ones: against float64 of what its heads see."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`octopi ask` and `octopi describe`: what a person types, what machines read, and going on after a kill."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """The demo: what the page is given, what it refuses, and all of it in a real browser."""
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import threading

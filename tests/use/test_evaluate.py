@@ -1,7 +1,5 @@
 """The model that is shipped: whole, small, found from anywhere, and not random."""
 
-from __future__ import annotations
-
 import re
 import runpy
 from collections import Counter

@@ -1,7 +1,5 @@
 """The folder of a trained model: whole, without pickles, and noticed where anything in it or below it is another."""
 
-from __future__ import annotations
-
 import json
 import runpy
 import shutil

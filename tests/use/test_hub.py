@@ -1,7 +1,5 @@
 """Models on the Hugging Face Hub: huggingface_hub itself, in processes of their own, against a small server."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """`octopi live`: presses found while they happen, on files and on a camera that drops frames."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

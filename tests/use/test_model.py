@@ -1,7 +1,5 @@
 """A packaged model answers as the evaluation did, remembers touches, and refuses what it cannot answer in one line."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The folder that the studio fills: read by the catalogue's own reader, and nothing is lost on the way."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pandas as pd

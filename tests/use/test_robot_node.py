@@ -1,7 +1,5 @@
 """The example node: its ROS side against a double of rclpy, its HTTP side against a served model."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 from collections.abc import Iterator

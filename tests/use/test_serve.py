@@ -1,7 +1,5 @@
 """`octopi serve` in process: OpenAI's forms field by field, and every way to be refused."""
 
-from __future__ import annotations
-
 import json
 import re
 import threading

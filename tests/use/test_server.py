@@ -1,7 +1,5 @@
 """`octopi serve` on a real socket: many clients, slow ones, rude ones, and its end; and the demo's command."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """The studio: a camera that is odd in every way, and the whole page in a real browser, killed in the middle."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import time

@@ -1,7 +1,5 @@
 """Questions that wait are answered in one batch, each as it would be alone."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from collections.abc import AsyncGenerator, Collection, Iterator, Sequence

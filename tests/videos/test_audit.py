@@ -1,7 +1,5 @@
 """The audit of single videos, of labels, of a folder and of the chain, on files good and bad, and on public videos."""
 
-from __future__ import annotations
-
 import json
 import runpy
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """What the audit finds that parts share, and what tells a label without touch."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

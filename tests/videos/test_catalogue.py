@@ -1,7 +1,5 @@
 """The catalogue against the paper's tables, bad ones, which classes a free text names, and splits by object."""
 
-from __future__ import annotations
-
 import itertools
 import shutil
 from collections import Counter

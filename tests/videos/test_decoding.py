@@ -1,7 +1,5 @@
 """What comes out of the decoder and how frames become squares, against OpenCV, PIL and the textbook's colours."""
 
-from __future__ import annotations
-
 import multiprocessing
 import shutil
 import struct

@@ -1,7 +1,5 @@
 """The extraction as a whole: what lies in its files, how it goes on after a kill, and what hard videos do to it."""
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import math

@@ -1,7 +1,5 @@
 """Recordings cut into presses: bags of both ROS versions, long videos, folders of pictures."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from fractions import Fraction

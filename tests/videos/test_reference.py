@@ -1,7 +1,5 @@
 """The no-contact reference, light that changes, and which frames are kept, against slow second implementations."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from unittest.mock import patch

@@ -1,7 +1,5 @@
 """What base weights lack, or what is wrong with them, is said in a line: when a scale is chosen, and at loading."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable

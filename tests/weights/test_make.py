@@ -1,7 +1,5 @@
 """Base models that are made compute what their sources do and come out equal twice; Sparsh against float64."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from pickle import UnpicklingError
 

@@ -1,7 +1,5 @@
 """Downloaded models in their published layouts, at tiny widths: converted, checked, or refused in a line."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 from collections.abc import Callable
