@@ -150,13 +150,9 @@ def test_it_tells_touches_apart_from_any_folder(
 def test_a_runs_videos_are_asked_about_twice(octopi: Octopi, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What it says of them is what it says to a person who asks; an object that it was trained on stops the stage."""
     changed = ["data.source=videos", f"data.dir={EXAMPLES}", f"data.catalogue={ROOT}/pipeline/physiclear"]
-    few = [
-        "kernels=machine",
-        "evaluate.questions=4",
-        "evaluate.repeats=2",
-        "questions.evaluation={opd:9,pc:9,pss:0,pom:9,psr:0}",
-    ]
-    write_params(compose("smoke", [*changed, *few], ROOT / "conf"), tmp_path / "params.yaml")
+    changed += ["kernels=machine", "evaluate.questions=4", "evaluate.repeats=2"]
+    changed += ["questions.evaluation={opd:9,pc:9,pss:0,pom:9,psr:0}"]
+    write_params(compose("smoke", changed, ROOT / "conf"), tmp_path / "params.yaml")
     monkeypatch.chdir(tmp_path)
     # Two threads of each of two test processes would wait for each other on two cores.
     monkeypatch.setattr("pipeline.core.runtime.limit_threads", lambda _: None)

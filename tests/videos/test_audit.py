@@ -14,7 +14,7 @@ from scipy.special import betaincinv
 from pipeline.config import SplitConfig
 from pipeline.core.io import read_csv, write_table
 from pipeline.core.records import Part
-from pipeline.scales import compose, write_params
+from pipeline.scales import write_params
 from pipeline.videos.audit import leakage
 from pipeline.videos.audit.files import by_rate, check_files
 from pipeline.videos.audit.labels import check_labels, icc3k
@@ -26,6 +26,7 @@ from tests import audit_records as made
 from tests.audit_records import ERROR, GOOD_SPLIT, INFO, OBJECTS, OTHER, WARNING, assigned, odd, of, probe, probes
 from tests.closure import ROOT
 from tests.conftest import moving_square, write_video
+from tests.fake_run import fake_params
 
 pytestmark = pytest.mark.usefixtures("few_permutations")
 PAPER = SplitConfig(name="paper")
@@ -64,13 +65,7 @@ def test_every_broken_file_is_found_and_raises_nothing(tmp_path: Path, catalogue
 @pytest.fixture
 def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """What the stage reads: parameters, measurements, a split, and files that only have to have names."""
-    overrides = [
-        "kernels=machine",
-        "data.source=videos",
-        "data.dir=videos",
-        f"data.catalogue='{ROOT / 'pipeline/physiclear'}'",
-    ]
-    write_params(compose("smoke", overrides, ROOT / "conf"), tmp_path / "params.yaml")
+    write_params(fake_params("data.source=videos", "data.dir=videos"), tmp_path / "params.yaml")
     (tmp_path / "videos").mkdir()
     monkeypatch.chdir(tmp_path)
     fill(tmp_path, probes(2), GOOD_SPLIT)
