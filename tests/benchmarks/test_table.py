@@ -95,8 +95,6 @@ def test_errors_have_intervals_over_objects() -> None:
 
 
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    from benchmarks import contact
-
     monkeypatch.chdir(tmp_path)
     merge(CSV, rows("other", ("a", 1, 0.2)))
     monkeypatch.setattr(contact, "measure", lambda root: rows("contact", ("x", 1, 0.1), ("y", 2, 0.05)))

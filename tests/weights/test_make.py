@@ -123,8 +123,6 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert contents(Path("weights/tiny-clip")) == contents(Path("else/where")) == contents(model_folder("tiny-clip"))
 
 
-pytestmark = pytest.mark.usefixtures("elsewhere")
-
 WIDTH, HEADS, REGISTERS, DEPTH, PATCH, SIDE = 128, 2, 2, 3, 16, 224
 State = dict[str, torch.Tensor]
 
@@ -188,6 +186,7 @@ def adopted(*files: str) -> Path:
     return adopt("sparsh", Path("download"), Path("sparsh"))
 
 
+@pytest.mark.usefixtures("elsewhere")
 def test_features_are_those_of_an_independent_forward_pass_of_the_same_picture_twice() -> None:
     folder = adopted("dino_vitbase")
     assert {f.name for f in folder.iterdir()} == {"config.json", "model.safetensors", "README.md", "SHA256SUMS"}
