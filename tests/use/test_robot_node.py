@@ -120,7 +120,6 @@ def test_what_goes_wrong_is_one_line_of_the_server(node: Any, tmp_path: Path, mo
     (notes := tmp_path / "notes.mp4").write_text("no video")
     video = press(tmp_path / "a.mp4")
     for asked, told, answer in (
-        (goal("Soft?", notes), "video", ""),
         (goal("{tactile} {tactile}?", video), "2 {tactile} for 1 video;", ""),
         (goal("Soft?", tmp_path / "none.mp4"), "none.mp4", ""),
         (goal("crash", video), str(Failed()), "{tactile} crash "),  # What came is kept, but it is no answer.
