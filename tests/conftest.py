@@ -45,14 +45,19 @@ settings.register_profile("house", **SAME, max_examples=60, suppress_health_chec
 settings.load_profile("house")
 
 
+def wait_for(condition: Callable[[], object]) -> None:
+    """Until it is true; fails where it never is."""
+    end = time.monotonic() + HUNG
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
 def wait_until_ended(processes: Iterable[psutil.Process]) -> None:
     """A zombie has ended, even where nobody fetches it; a process of the same number is another."""
-    end = time.monotonic() + HUNG
     for process in processes:
         with suppress(psutil.NoSuchProcess):
-            while process.is_running() and process.status() != psutil.STATUS_ZOMBIE:
-                assert time.monotonic() < end, f"{process} is alive"
-                time.sleep(0.02)
+            wait_for(lambda process=process: not process.is_running() or process.status() == psutil.STATUS_ZOMBIE)
 
 
 def not_utf8(folder: Path, name: str) -> Path:

@@ -1,6 +1,5 @@
 """The command `octopi`: what a person sees, and the exit status."""
 
-import csv
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -12,6 +11,7 @@ from pipeline.config.params import load_params
 from pipeline.scales import compose, write_params
 from tests.closure import ROOT
 from tests.conftest import moving_square, octopi, write_video
+from tests.report.conftest import rows_of
 
 
 @pytest.fixture
@@ -109,8 +109,7 @@ def test_data_check_lists_every_error_first(folder: Path) -> None:
 def test_data_audit_writes_all_it_shows_and_ends_with_status_1_where_parts_share_a_video(folder: Path) -> None:
     for status, severities in ((0, {"warning", "info"}), (1, {"error", "warning", "info"})):
         said = octopi("data", "audit", "videos", "--split", "paper", "--out", "found/audit.csv", status=status)
-        with Path("found/audit.csv").open(newline="", encoding="utf-8") as stream:
-            rows = list(csv.DictReader(stream))
+        rows = rows_of(Path("found/audit.csv"))
         assert list(rows[0]) == ["check", "item", "measured", "expected", "severity"]
         assert {row["severity"] for row in rows} == severities
         first, *shown = said.splitlines()

@@ -10,7 +10,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -38,7 +37,7 @@ from pipeline.tracking.publish import publish
 from pipeline.tracking.store import TrackingError, out_of_reach
 from pipeline.training.trainer import TrainableTrainer, Trained, train, training_arguments
 from tests.closure import ROOT
-from tests.conftest import HUNG
+from tests.conftest import HUNG, wait_for
 from tests.tracking.conftest import FIRST, FULL, FakeChain, by_name, client, losses, runs
 
 ALIGN = "align@finetuned-all-0"
@@ -82,10 +81,7 @@ def test_a_training_and_publishing_share_a_run(chain: FakeChain, monkeypatch: py
         with live(stage) as callbacks:
             assert by_name("stage")[ALIGN].info.status == "RUNNING"
             trained = fit(chain.params, callbacks)
-            deadline = time.monotonic() + HUNG
-            while not any(m.startswith("system/") for m in by_name("stage")[ALIGN].data.metrics):
-                assert time.monotonic() < deadline, "no system metrics"
-                time.sleep(0.1)
+            wait_for(lambda: any(m.startswith("system/") for m in by_name("stage")[ALIGN].data.metrics))
     run, (parent,) = by_name("stage")[ALIGN], runs("reproduction")
     assert (run.info.status, parent.info.status) == ("RUNNING" if broken else "FINISHED", "RUNNING")
     assert run.info.start_time == int(stage.started * 1000)
@@ -285,8 +281,5 @@ def test_a_server_that_dies_meanwhile(chain: FakeChain, tmp_path: Path, caplog: 
 
 def address(log: Path) -> str:
     """Where a server listens, at a port that it chose itself, as soon as it says so."""
-    deadline = time.monotonic() + HUNG
-    while not (found := re.search(r"running on (http://\S+)", log.read_text())):
-        assert time.monotonic() < deadline, "the server did not start"
-        time.sleep(0.3)
-    return found[1]
+    wait_for(lambda: " running on http" in log.read_text())
+    return re.findall(r"running on (http://\S+)", log.read_text())[0]

@@ -7,7 +7,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,7 +20,7 @@ import pytest
 from pipeline.use.serve import make_app
 from pipeline.videos.catalogue import load_catalogue
 from tests.closure import ROOT
-from tests.conftest import HUNG, wait_until_ended
+from tests.conftest import HUNG, wait_for, wait_until_ended
 from tests.use.fake import CHAT, FakeOctopi, body, digest, events, part, running, said, text, user
 from tests.use.shared import Made
 from tests.use.videos import video
@@ -49,13 +49,6 @@ def listens(address: str) -> bool:
     except ConnectionError:
         return False
     return True
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + HUNG
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 def test_no_answer_of_many_clients_is_lost_or_mixed_up() -> None:
