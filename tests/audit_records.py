@@ -12,13 +12,12 @@ from pipeline.scenes.light import make_sensor
 from pipeline.scenes.recipe import recipe_of
 from pipeline.scenes.render import make_scene, render
 from pipeline.videos.audit.leakage import check_leakage
-from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.records import Assignment, Finding, Probe, Severity
-from tests.closure import ROOT
+from tests.conftest import CATALOGUE as PHYSICLEAR
 from tests.frame_rules import scanned
 
 ERROR, WARNING, INFO = Severity.ERROR, Severity.WARNING, Severity.INFO
-PHYSICLEAR = load_catalogue(ROOT / "pipeline" / "physiclear")
 OBJECTS = ("baseball", "cotton_ball", "pillow", "potato", "rug", "millet", "lemon", "orange")
 GOOD_SPLIT = {o: (Part.TRAIN, Part.VALIDATION, Part.TEST)[i % 3] for i, o in enumerate(OBJECTS)}
 SCENE = ScenesConfig(frames=24, width=128, height=96)

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     import torch
 
 ROOT = Path(__file__).parents[1]
+PHYSICLEAR = ROOT / "pipeline" / "physiclear"
+CATALOGUE = load_catalogue(PHYSICLEAR)
 DATA_VARIABLE = "OCTOPI_DATA_DIR"
 NO_DATA = f"needs real videos: set {DATA_VARIABLE} to a folder of the PhysiCLeAR videos"
 
@@ -113,7 +115,7 @@ def real_data() -> Path:
 
 @pytest.fixture(scope="session")
 def catalogue() -> Catalogue:
-    return load_catalogue(ROOT / "pipeline" / "physiclear")
+    return CATALOGUE
 
 
 @pytest.fixture(scope="session")

@@ -14,10 +14,9 @@ from pipeline.encoder.recipes import RECIPES
 from pipeline.language.start import objects_met
 from pipeline.running.errors import UserError, without_secrets
 from pipeline.scales import check_inputs, compose, prune, scale_names, write_params
-from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.split import assign_objects
 from tests.closure import ROOT
-from tests.conftest import refused
+from tests.conftest import CATALOGUE, refused
 
 CONF = ROOT / "conf"
 
@@ -174,7 +173,7 @@ def test_a_model_that_met_a_test_object(listed: bool, tmp_path: Path, monkeypatc
     (tmp_path / "language").mkdir()
     folds = ["split.name=kfold", "split.folds=3", "scenes.objects=[]", f"language.start={tmp_path}"]
     first, second = (compose("smoke", [*folds, f"ablation.seeds=[{seed}]"]) for seed in (0, 1))
-    objects = load_catalogue(ROOT / "pipeline" / "physiclear")
+    objects = CATALOGUE
     parts = assign_objects(objects, objects.objects, first.split, 0)
     write_json(tmp_path / "config.json", {"objects": objects_met("", parts)} if listed else {})
     write_json(tmp_path / "catalogue.json", objects.model_dump(mode="json"))

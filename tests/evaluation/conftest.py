@@ -7,11 +7,8 @@ from hypothesis import strategies as st
 
 from pipeline.evaluation.intervals import Objects
 from pipeline.evaluation.records import Graded
-from pipeline.videos.catalogue import load_catalogue
-from tests.closure import ROOT
 
 About = tuple[Objects, ...]
-CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
 OBJECTS = [f"object{i}" for i in range(6)]
 PAIRS = list(itertools.combinations(OBJECTS, 2))
 

@@ -12,8 +12,7 @@ from pipeline.encoder.records import Classification
 from pipeline.evaluation.calibration import calibration_error, calibration_rows, fit_temperature, rescale
 from pipeline.evaluation.maps import map_frame
 from pipeline.videos.records import Assignment
-from tests.conftest import classified
-from tests.evaluation.conftest import CATALOGUE
+from tests.conftest import CATALOGUE, classified
 
 
 def said(expected: int, *probabilities: float, object_id: str = "rug") -> Classification:

@@ -16,8 +16,8 @@ from pipeline.evaluation.rows import EffectRow, ScoreRow
 from pipeline.evaluation.scores import effect_rows, score_rows, with_holm
 from pipeline.tasks import TASKS
 from pipeline.tasks.records import Score
-from tests.conftest import classified
-from tests.evaluation.conftest import CATALOGUE, PAIRS, graded
+from tests.conftest import CATALOGUE, classified
+from tests.evaluation.conftest import PAIRS, graded
 
 RNG = np.random.default_rng(1)
 

@@ -18,13 +18,11 @@ from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.training import trainer
 from pipeline.training.embeddings import FLIPS, EmbeddingStore
 from pipeline.training.trainer import Trained
-from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.records import Assignment
 from tests.checkpoints import write_llama
-from tests.conftest import ROOT
+from tests.conftest import CATALOGUE
 
 FRAMES, DIM = 2, 6
-CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
 
 
 def stored(folder: Path, frames: Sequence[tuple[str, int, str]], tensor: torch.Tensor) -> EmbeddingStore:

@@ -18,7 +18,7 @@ from pipeline.scenes.invented import classes_of, draw, invented_catalogue, write
 from pipeline.scenes.recipe import SceneRecipe, load_recipes, recipe_of
 from pipeline.scenes.render import make_scene, measure_scene
 from pipeline.videos.catalogue import Catalogue, load_catalogue
-from tests.conftest import ROOT, refused
+from tests.conftest import CATALOGUE, PHYSICLEAR, ROOT, refused
 
 
 def test_each_combination_comes_as_often() -> None:
@@ -66,7 +66,7 @@ def test_it_is_written_as_a_catalogue_of_seed_and_number(here: Path, monkeypatch
     assert not few.keys() & other.keys()
     assert not {*few.values()} & {*other.values()}
     assert catalogue.language.dataset != "PhysiCLeAR", "its published figures are not about these"
-    assert not load_catalogue(ROOT / "pipeline" / "physiclear").objects.keys() & catalogue.objects.keys()
+    assert not CATALOGUE.objects.keys() & catalogue.objects.keys()
 
 
 def test_a_killed_drawing_goes_on_from_what_is_finished(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -97,9 +97,6 @@ def test_a_killed_drawing_goes_on_from_what_is_finished(here: Path, monkeypatch:
 def test_its_scale_is_checked_before_the_catalogue_is_written(here: Path) -> None:
     check_inputs(compose("invented", ["invent.objects=54"], conf=ROOT / "conf"))
     assert not (here / "data").exists()
-
-
-PHYSICLEAR = ROOT / "pipeline" / "physiclear"
 
 
 def test_every_object_has_a_recipe_of_its_own(catalogue: Catalogue) -> None:

@@ -20,12 +20,11 @@ from pipeline.scenes.render import make_scene, render
 from pipeline.scenes.video import share_as_labelled, synthesize
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import list_videos
-from tests.conftest import ROOT, refused
+from tests.conftest import PHYSICLEAR, refused
 from tests.frame_rules import decode, scanned
 
 SMALL = ScenesConfig(objects=("rug",), videos_per_object=2, frames=8, width=64, height=48)
 PLAIN = SceneRecipe(modulus=100.0, body=Round(radii=(30.0, 30.0)))
-PHYSICLEAR = ROOT / "pipeline" / "physiclear"
 
 
 @pytest.fixture(scope="module")

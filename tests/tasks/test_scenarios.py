@@ -16,12 +16,12 @@ from pipeline.tasks.examples import build_examples, grade_example
 from pipeline.tasks.questions import build_questions
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.records import Assignment
+from tests.conftest import CATALOGUE as PHYSICLEAR
 from tests.conftest import ROOT, refused
 from tests.tasks.shared import CATALOGUE, grade, predicted
 
-WHOLE = load_catalogue(ROOT / "pipeline" / "physiclear")
 TESTED = {
-    split: [o for o, entry in WHOLE.objects.items() if entry.splits[split] == Part.TEST]
+    split: [o for o, entry in PHYSICLEAR.objects.items() if entry.splits[split] == Part.TEST]
     for split in ("paper", "release")
 }
 BRISTLES, HANDLE, BRUSH = "hairbrush_bristles", "hairbrush_handle", "toilet_brush_bristles"
@@ -63,21 +63,21 @@ def asked(catalogue: Catalogue, objects: list[str]) -> Mapping[str, tuple[set[st
 
 @pytest.mark.parametrize(("split", "source"), list(PAIRS))
 def test_pairs_are_those_of_their_source(split: str, source: str) -> None:
-    assert asked(WHOLE.asking(source), TESTED[split]) == PAIRS[split, source]
+    assert asked(PHYSICLEAR.asking(source), TESTED[split]) == PAIRS[split, source]
 
 
 def test_a_part_without_the_object_asks_about_its_classes() -> None:
-    objects = [o for o in WHOLE.objects if o != CLOTH]
-    right, wrong = asked(WHOLE.asking("published"), objects)["stains"]
-    assert {WHOLE.labels(o)[:2] for o in right} == {(1, 1)} == {WHOLE.labels(CLOTH)[:2]}
-    assert {WHOLE.labels(o)[:2] for o in wrong} == {(2, 2)}
+    objects = [o for o in PHYSICLEAR.objects if o != CLOTH]
+    right, wrong = asked(PHYSICLEAR.asking("published"), objects)["stains"]
+    assert {PHYSICLEAR.labels(o)[:2] for o in right} == {(1, 1)} == {PHYSICLEAR.labels(CLOTH)[:2]}
+    assert {PHYSICLEAR.labels(o)[:2] for o in wrong} == {(2, 2)}
 
 
 def test_a_catalogues_own_scenarios_are_always_asked() -> None:
-    own = tuple(s.model_copy(update={"source": ""}) for s in WHOLE.asking("ours").language.scenarios)
-    catalogue = WHOLE.model_copy(update={"language": WHOLE.language.model_copy(update={"scenarios": own})})
+    own = tuple(s.model_copy(update={"source": ""}) for s in PHYSICLEAR.asking("ours").language.scenarios)
+    catalogue = PHYSICLEAR.model_copy(update={"language": PHYSICLEAR.language.model_copy(update={"scenarios": own})})
     assert catalogue.asking("published").language.scenarios == own == catalogue.asking("ours").language.scenarios
-    assert [s.name for s in WHOLE.asking("ours").language.scenarios] == ["stains", "grip", "ice"]
+    assert [s.name for s in PHYSICLEAR.asking("ours").language.scenarios] == ["stains", "grip", "ice"]
 
 
 EXAMPLE = ROOT / "examples" / "avocado"
@@ -114,7 +114,7 @@ def test_pairs_have_two_ranks_and_the_softer_one_is_riper() -> None:
             assert len(dialogue.turns) == turns
             assert dialogue.turns[0].user == TALK
             assert [turn.user.count("{tactile}") for turn in dialogue.turns] == [0, 2, 0][:turns]
-    questions = pairs(WHOLE, ["avocado_unripe", "avocado_kinda_ripe", "rug", "lemon"], 20)
+    questions = pairs(PHYSICLEAR, ["avocado_unripe", "avocado_kinda_ripe", "rug", "lemon"], 20)
     assert {frozenset(q.objects) for q in questions} == {frozenset({"avocado_unripe", "avocado_kinda_ripe"})}
     assert all(q.objects["ab".index(q.gold.choice)] == "avocado_kinda_ripe" for q in questions)
 

@@ -20,17 +20,15 @@ from pipeline.use.model import Octopi
 from pipeline.use.results import Exchange
 from pipeline.use.server import Failed
 from pipeline.videos.catalogue import Catalogue
-from tests.conftest import HUNG, ROOT, refused
+from tests.conftest import HUNG, PHYSICLEAR, refused
 from tests.use.browser import tab
 from tests.use.fake import KEPT, FakeOctopi, digest, running
 from tests.use.videos import press
 
-CATALOGUE = ROOT / "pipeline" / "physiclear"
-
 
 @pytest.fixture(scope="module")
 def session(catalogue: Catalogue) -> Session:
-    recipes = load_recipes(CATALOGUE, catalogue, 0)
+    recipes = load_recipes(PHYSICLEAR, catalogue, 0)
     model: Any = FakeOctopi()
     return Session(model, catalogue, {o: recipes[o] for o in ("baseball", "pillow")})
 

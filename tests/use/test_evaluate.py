@@ -33,11 +33,11 @@ from pipeline.use.adapt import adapt
 from pipeline.use.evaluate import answers_about, answers_after_ratings
 from pipeline.use.folder import Base, find_base, read_folder
 from pipeline.use.model import REAL, Octopi, on_real_videos
-from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.records import Assignment, Video
 from tests.checkpoints import model_folder
 from tests.closure import ROOT
-from tests.conftest import fake_videos
+from tests.conftest import CATALOGUE, fake_videos
 
 EXAMPLES = ROOT / "examples"
 LARGEST, RANK, VIDEO = 40e6, 32, 200_000
@@ -199,9 +199,8 @@ def test_after_ratings_it_answers_as_its_copy(octopi: Octopi, tmp_path: Path, mo
     split = [
         Assignment(video_id=v.video_id, object_id=v.object_id, part=parts.get(v.object_id, Part.TEST)) for v in videos
     ]
-    catalogue = load_catalogue(ROOT / "pipeline" / "physiclear")
     own = [EXAMPLES / f"{files[name]}.mp4" for name in parts]
-    for count, ratings in ((0, None), (2, catalogue)):
+    for count, ratings in ((0, None), (2, CATALOGUE)):
         graded = answers_after_ratings(octopi, params, videos, split, 0, count)
         assert {r.model for r in graded} == {f"octopi-small, adapted by {count}"}
         assert {r.objects for r in graded} == {("pillow",), ("steel_wool",)}

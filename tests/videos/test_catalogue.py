@@ -18,9 +18,8 @@ from pipeline.core.records import Part
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.catalogue.wording import levels_named, mentioned
 from pipeline.videos.split import VALIDATION, assign, untested
-from tests.conftest import ROOT, fake_videos, refused
+from tests.conftest import CATALOGUE, PHYSICLEAR, fake_videos, refused
 
-PHYSICLEAR = ROOT / "pipeline" / "physiclear"
 PAPER_TEST = {
     *("bath_towel", "clothes_peg", "hairbrush_bristles", "hairbrush_handle", "ice_block", "microfiber_cloth"),
     "toilet_brush_bristles",
@@ -174,9 +173,6 @@ def test_a_language_that_cannot_be_graded_is_refused(tmp_path: Path, changes: di
     (tmp_path / "properties.yaml").write_text(yaml.safe_dump(language))
     with refused(words):
         load_catalogue(tmp_path)
-
-
-CATALOGUE = load_catalogue(PHYSICLEAR)
 
 
 @pytest.mark.parametrize(
