@@ -22,8 +22,7 @@ from pipeline.videos.records import Assignment, Finding, Severity, Video
 from pipeline.videos.split import assign
 from pipeline.weights import is_random
 from tests.checkpoints import model_folder
-from tests.closure import ROOT
-from tests.conftest import classified
+from tests.conftest import ROOT, classified
 
 
 def fake_params(*overrides: str) -> Params:

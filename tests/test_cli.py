@@ -9,8 +9,7 @@ from typer.testing import CliRunner
 from pipeline.cli import app
 from pipeline.config.params import load_params
 from pipeline.scales import compose, write_params
-from tests.closure import ROOT
-from tests.conftest import moving_square, octopi, write_video
+from tests.conftest import ROOT, moving_square, octopi, write_video
 from tests.report.conftest import rows_of
 
 

@@ -15,8 +15,7 @@ from pipeline.language.start import objects_met
 from pipeline.running.errors import UserError, without_secrets
 from pipeline.scales import check_inputs, compose, prune, scale_names, write_params
 from pipeline.videos.split import assign_objects
-from tests.closure import ROOT
-from tests.conftest import CATALOGUE, refused
+from tests.conftest import CATALOGUE, ROOT, refused
 
 CONF = ROOT / "conf"
 

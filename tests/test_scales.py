@@ -19,8 +19,7 @@ from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.split import ENOUGH, MORE, few
 from pipeline.weights.check import parameters, read_language, read_tower
 from tests.checkpoints import write_clip, write_llama
-from tests.closure import ROOT
-from tests.conftest import octopi, refused
+from tests.conftest import ROOT, octopi, refused
 
 
 @pytest.fixture(autouse=True)

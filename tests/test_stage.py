@@ -19,8 +19,7 @@ from pipeline.running.errors import UserError
 from pipeline.running.parallel import device_here, use_backend
 from pipeline.running.stage import running_stages, stage
 from pipeline.scales import check_inputs, compose, write_params
-from tests.closure import ROOT
-from tests.conftest import octopi, refused
+from tests.conftest import ROOT, octopi, refused
 
 
 def test_a_stage_says_when_it_starts_and_ends_and_what_it_cost(here: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,8 +11,7 @@ from pipeline.core.layout import questions_file
 from pipeline.core.records import Opd, Question
 from pipeline.report.load import load_report
 from pipeline.tasks import TASKS
-from tests.closure import ROOT
-from tests.conftest import octopi, refused
+from tests.conftest import ROOT, octopi, refused
 from tests.fake_run import fake_params, write_run
 
 FEW = ("ablation.encoders=[finetuned]", "ablation.touch=[]", "questions.evaluation={opd:4,pc:4,pss:4,pom:4,psr:4}")

@@ -24,8 +24,7 @@ from pipeline.core.io import write_jsonl
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import Material
 from pipeline.running.errors import UserError
-from tests.closure import ROOT
-from tests.conftest import HUNG
+from tests.conftest import HUNG, ROOT
 from tests.language.sharded import CONFIG, KINDS, run
 
 CHECKPOINT = {

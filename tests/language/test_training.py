@@ -26,8 +26,7 @@ from pipeline.scales import compose
 from pipeline.training.embeddings import STATISTICS_FILE, EmbeddingStore
 from pipeline.training.trainer import Trained, training_arguments
 from tests.checkpoints import contents, write_llama
-from tests.closure import ROOT
-from tests.conftest import Begun, refused
+from tests.conftest import ROOT, Begun, refused
 from tests.language.conftest import (
     DIM,
     SMALL,

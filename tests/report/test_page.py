@@ -14,8 +14,7 @@ from pipeline.report import page as module
 from pipeline.report.page import LARGEST, PAGE, left_to_users, write_page
 from pipeline.report.render import WORDS
 from tests.checkpoints import edit
-from tests.closure import ROOT
-from tests.conftest import octopi, refused
+from tests.conftest import ROOT, octopi, refused
 from tests.report.conftest import Page, report, rows_of, score, words, write_reports, write_rows
 
 NUMBER = re.compile(r"[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]\d+)?")

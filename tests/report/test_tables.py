@@ -17,8 +17,7 @@ from pipeline.report.tables import FIVE_TASKS, SHIPPED_TABLE, TABLES, headline, 
 from pipeline.scales import compose
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import Catalogue, load_catalogue
-from tests.closure import ROOT
-from tests.conftest import fake_videos, refused
+from tests.conftest import ROOT, fake_videos, refused
 from tests.report.conftest import effect, report, score
 
 PRINTED = [f"Published {model} % (n, ~ inferred)" for model in ("7b", "13b", "PG-InstructBLIP")]

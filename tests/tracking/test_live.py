@@ -36,8 +36,7 @@ from pipeline.tracking.live import live
 from pipeline.tracking.publish import publish
 from pipeline.tracking.store import TrackingError, out_of_reach
 from pipeline.training.trainer import TrainableTrainer, Trained, train, training_arguments
-from tests.closure import ROOT
-from tests.conftest import HUNG, wait_for
+from tests.conftest import HUNG, ROOT, wait_for
 from tests.tracking.conftest import FIRST, FULL, FakeChain, by_name, client, losses, runs
 
 ALIGN = "align@finetuned-all-0"

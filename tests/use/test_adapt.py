@@ -15,8 +15,7 @@ from pipeline.use.folder import CONFIG, find_base, read_folder
 from pipeline.use.model import UNRATED, Octopi
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from tests.checkpoints import edit, model_folder
-from tests.closure import ROOT
-from tests.conftest import refused, write_video
+from tests.conftest import ROOT, refused, write_video
 from tests.use.shared import Made
 
 EXAMPLES = ROOT / "examples"

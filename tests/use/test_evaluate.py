@@ -36,8 +36,7 @@ from pipeline.use.model import REAL, Octopi, on_real_videos
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.records import Assignment, Video
 from tests.checkpoints import model_folder
-from tests.closure import ROOT
-from tests.conftest import CATALOGUE, fake_videos
+from tests.conftest import CATALOGUE, ROOT, fake_videos
 
 EXAMPLES = ROOT / "examples"
 LARGEST, RANK, VIDEO = 40e6, 32, 200_000

@@ -17,8 +17,7 @@ from pipeline.use.model import Octopi
 from pipeline.use.package import export, package
 from pipeline.videos.catalogue import load_catalogue
 from tests.checkpoints import contents, edit, write_llama
-from tests.closure import ROOT
-from tests.conftest import octopi, refused
+from tests.conftest import ROOT, octopi, refused
 from tests.fake_run import fake_params
 from tests.use.shared import PARTS, Made
 

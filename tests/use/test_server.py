@@ -19,8 +19,7 @@ import pytest
 
 from pipeline.use.serve import make_app
 from pipeline.videos.catalogue import load_catalogue
-from tests.closure import ROOT
-from tests.conftest import HUNG, wait_for, wait_until_ended
+from tests.conftest import HUNG, ROOT, wait_for, wait_until_ended
 from tests.use.fake import CHAT, FakeOctopi, body, digest, events, part, running, said, text, user
 from tests.use.shared import Made
 from tests.use.videos import video

@@ -18,8 +18,7 @@ from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.film import write_film
 from pipeline.videos.importing.presses import Shot
 from tests.checkpoints import model_folder
-from tests.closure import ROOT
-from tests.conftest import HUNG, wait_for
+from tests.conftest import HUNG, ROOT, wait_for
 from tests.use.browser import Tab, tab
 from tests.use.test_live import Camera
 from tests.use.videos import recording

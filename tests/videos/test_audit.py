@@ -24,8 +24,7 @@ from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.records import Assignment, Finding, Probe, Video
 from tests import audit_records as made
 from tests.audit_records import ERROR, GOOD_SPLIT, INFO, OBJECTS, OTHER, WARNING, assigned, odd, of, probe, probes
-from tests.closure import ROOT
-from tests.conftest import moving_square, write_video
+from tests.conftest import ROOT, moving_square, write_video
 from tests.fake_run import fake_params
 
 pytestmark = pytest.mark.usefixtures("few_permutations")

@@ -18,8 +18,7 @@ from pipeline.weights.make import RECIPES, make, write_efficientnet
 from pipeline.weights.published import adopt
 from pipeline.weights.sparsh import write
 from tests.checkpoints import contents, model_folder
-from tests.closure import ROOT
-from tests.conftest import octopi, refused
+from tests.conftest import ROOT, octopi, refused
 
 LITE, SMOLLM2 = (MADE[name].origin for name in ("efficientnet-lite0", "smollm2"))
 

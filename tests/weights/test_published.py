@@ -19,8 +19,7 @@ from pipeline.weights import DOWNLOADED
 from pipeline.weights.check import PUBLISHED_LANGUAGE, check_language_files
 from pipeline.weights.make import CATALOGUE
 from tests.checkpoints import CLIP_CONFIG, contents, cut, edit, replace, write_clip
-from tests.closure import ROOT
-from tests.conftest import octopi, refused
+from tests.conftest import ROOT, octopi, refused
 
 PICTURES = {"mean": [*open_clip.OPENAI_DATASET_MEAN], "std": [*open_clip.OPENAI_DATASET_STD]}
 WORDS = 600
