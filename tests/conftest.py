@@ -36,7 +36,6 @@ ROOT = Path(__file__).parents[1]
 PHYSICLEAR = ROOT / "pipeline" / "physiclear"
 CATALOGUE = load_catalogue(PHYSICLEAR)
 DATA_VARIABLE = "OCTOPI_DATA_DIR"
-NO_DATA = f"needs real videos: set {DATA_VARIABLE} to a folder of the PhysiCLeAR videos"
 
 HUNG = 600.0
 """Seconds after which a test may take something for hung, however busy the machine is; nothing is measured by them."""
@@ -104,7 +103,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     if "torch" in sys.modules:
         sys.modules["torch"].manual_seed(67_280_421_310_721)  # As where it is imported later.
     if item.get_closest_marker("real") and not os.environ.get(DATA_VARIABLE):
-        pytest.skip(NO_DATA)
+        pytest.skip(f"needs real videos: set {DATA_VARIABLE} to a folder of the PhysiCLeAR videos")
 
 
 @pytest.fixture(scope="session")

@@ -106,10 +106,6 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
         command.main(["startup"])
 
 
-LENGTH = 20
-"""Frames of a video."""
-
-
 @pytest.fixture(scope="module")
 def project(catalogue: Catalogue, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A project with tiny models, and a video each of balls of twelve sizes."""
@@ -125,7 +121,7 @@ def project(catalogue: Catalogue, tmp_path_factory: pytest.TempPathFactory) -> P
     parts = {part: [o.object_id for o in known if o.splits["paper"] == part] for part in ("train", "validation")}
     for place, name in enumerate([*parts["train"][:10], *parts["validation"][:2]]):
         ball = np.exp(-((x - 48) ** 2 + (y - 36) ** 2) / (60 + 25 * place)).astype(np.float32)
-        skins = [np.float32(max(0, np.sin(t / 4 - 0.5))) * ball for t in range(LENGTH)]
+        skins = [np.float32(max(0, np.sin(t / 4 - 0.5))) * ball for t in range(20)]
         pictures = [shade(skin, sensor, 0.3, seed * 977) for seed, skin in enumerate(skins)]
         write_film(root / "films" / f"{name}_0.avi", pictures, 10.0)
     return root

@@ -133,7 +133,6 @@ def test_training_is_compared_with_the_most_ratings() -> None:
 
 
 Classes = tuple[int, int, int]
-ABOUT = [("a",), ("a",), ("b",), ("c",)]
 
 
 def heads(part: Part, predicted: dict[str, Classes], expected: Classes) -> list[Classification]:
@@ -153,7 +152,7 @@ def test_property_heads_on_test_and_on_validation_videos() -> None:
     assert [found[name].accuracy for name in names] == [0.75, 0.5, 1, 0.5]
     assert {(r.n, r.encoder, r.lora, r.opd, r.touch) for r in found.values()} == {(4, "finetuned", "", "", "real")}
     assert found["combined"].chance == pytest.approx(1 / 27, abs=1e-6)
-    interval = accuracy_interval(np.array([1.0, 0, 0, 1]), ABOUT)
+    interval = accuracy_interval(np.array([1.0, 0, 0, 1]), [("a",), ("a",), ("b",), ("c",)])
     assert (found["combined"].low, found["combined"].high) == pytest.approx(interval, abs=1e-6)
     assert row(rows, task="heads_validation", measure="combined", seed="all").n == 1
 

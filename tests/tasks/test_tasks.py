@@ -17,7 +17,6 @@ from pipeline.videos.catalogue import Catalogue
 from tests.tasks.shared import CATALOGUE, drafted, grade
 
 POOL = Pool(Part.TRAIN, CATALOGUE, {o: [f"{o}_{i}" for i in range(3)] for o in CATALOGUE.objects})
-HARDNESS = CATALOGUE.properties[0]
 EACH = 2
 every_task = pytest.mark.parametrize("task", list(TASKS))
 
@@ -115,7 +114,7 @@ def test_a_description_is_graded_property_by_property() -> None:
     ],
 )
 def test_levels_are_read_whole(level: int | None, texts: list[str]) -> None:
-    assert {find_level(text, HARDNESS) for text in texts} == {level}
+    assert {find_level(text, CATALOGUE.properties[0]) for text in texts} == {level}
 
 
 @every_task

@@ -28,7 +28,6 @@ from tests.conftest import ROOT, moving_square, write_video
 from tests.fake_run import fake_params
 
 pytestmark = pytest.mark.usefixtures("few_permutations")
-PAPER = SplitConfig(name="paper")
 
 
 def test_every_broken_file_is_found_and_raises_nothing(tmp_path: Path, catalogue: Catalogue) -> None:
@@ -43,7 +42,7 @@ def test_every_broken_file_is_found_and_raises_nothing(tmp_path: Path, catalogue
     (folder / "rug_7.mkv").symlink_to(folder / "nowhere.mkv")
     (folder / "rug_8.mov").mkdir()
     write_video(folder / "sub" / "millet_0.avi", moving_square(1, 9))
-    findings = audit_folder(folder, catalogue, PAPER)
+    findings = audit_folder(folder, catalogue, SplitConfig(name="paper"))
     severities = [f.severity for f in findings]
     assert severities == sorted(severities, key=[ERROR, WARNING, INFO].index)
     errors = {(f.check, f.item) for f in findings if f.severity is ERROR}
