@@ -67,9 +67,7 @@ def steady(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 
 @pytest.mark.parametrize(("shared", "read"), [(0, 1024), (1, 60), (25, 1), (25, 60)])
-def test_each_row_is_decoded_as_it_is_alone(
-    steady: OctopiForCausalLM, shared: int, read: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_row_as_alone(steady: OctopiForCausalLM, shared: int, read: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """In one part, in several, in as many as rows; each to its own limit or end."""
     monkeypatch.setattr(decoding, "READ", read)
     prompts, features = asked(steady, shared)
@@ -204,7 +202,7 @@ def test_an_answer_at_the_limit(model: OctopiForCausalLM, questions: list[Questi
     assert whole.outputs == cut.outputs, "the end token says nothing"
 
 
-def test_an_answer_ends_where_positions_do(questions: list[Question], store: EmbeddingStore, tmp_path: Path) -> None:
+def test_what_ends_where_positions_do(questions: list[Question], store: EmbeddingStore, tmp_path: Path) -> None:
     """Each row has its own limit; with the end token as padding, the cut must still be seen."""
     wide = OctopiForCausalLM.from_base(write_llama(tmp_path / "wide", pad="</s>"), DIM)
     asked = sorted((q for q in questions if q.task == "PSS"), key=lambda q: len(prompt(q, Opd.ALL, wide)))
@@ -218,9 +216,6 @@ def test_an_answer_ends_where_positions_do(questions: list[Question], store: Emb
     assert len(set(room)) > 2
     assert all(p.tokens <= own and p.truncated == (p.tokens == own) for p, own in zip(together, room, strict=True))
     assert any(p.tokens == 5 for p in together)
-
-
-def test_a_question_beyond_the_positions(questions: list[Question], store: EmbeddingStore, tmp_path: Path) -> None:
     setting = LanguageConfig(weights=str(write_llama(tmp_path, max_position_embeddings=60)))
     with refused(r"^[A-Z]+-train-\d+: takes \d+ tokens, .* 60 at once; lower frames.per_video"):
         assemble(material(setting, questions, store), taking(4), "test")

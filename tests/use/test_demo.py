@@ -127,15 +127,14 @@ def test_what_is_wrong_comes_back_as_one_line(site: str, tmp_path: Path) -> None
     assert httpx2.get(f"{site}/api/about").status_code == 200, "the server goes on"
 
 
-def test_a_video_beyond_the_limit_is_refused(site: str, session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_large_video_and_other_sites_are_refused(
+    site: str, session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("pipeline.use.demo.MOST_BYTES", 2_000_000)
     before = set(session.folder.iterdir())
     answer = put(site, "a.mp4", bytes(2_000_001))
     assert (answer.status_code, answer.json()["error"]) == (422, "a.mp4: more than 2 MB; drop a shorter video")
     assert set(session.folder.iterdir()) == before, "nothing of it is kept"
-
-
-def test_other_sites_are_not_let_in(site: str) -> None:
     assert httpx2.get(f"{site}/api/about", headers={"Host": "evil.example"}).status_code == 400
     plain = {"Content-Type": "text/plain"}  # What a page of another site may send without asking first.
     assert httpx2.post(f"{site}/api/ask", content=b'{"question": "hi"}', headers=plain).status_code == 422

@@ -97,7 +97,7 @@ def test_the_readmes_table_is_that_of_the_report() -> None:
         assert task not in row[0], "in words"
 
 
-def test_its_language_model_is_made_once(
+def test_its_llm_is_made_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

@@ -100,9 +100,7 @@ def test_what_is_pushed_comes_back_and_answers_alike(made: Made, hub: Hub, files
         (["--private"], {"HF_TOKEN": "ann"}, "is there already, and public"),
     ],
 )
-def test_what_cannot_be_pushed_ends_with_a_line(
-    options: list[str], environment: dict[str, str], line: str, made: Made, hub: Hub
-) -> None:
+def test_what_is_not_pushed(options: list[str], environment: dict[str, str], line: str, made: Made, hub: Hub) -> None:
     said = hub[0]("push", str(made.folder), NAME, *options, status=1, **environment)
     assert said.startswith(f"octopi: {NAME}: {line}")
     assert "\n" not in said

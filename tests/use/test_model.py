@@ -53,9 +53,7 @@ def test_onednn_gives_the_same_answers(made: Made) -> None:
     ],
     ids=["tuned", "release", "base of two backbones"],
 )
-def test_of_other_recipes_too(
-    variant: Variant, overrides: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_recipes(variant: Variant, overrides: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     made = make(tmp_path, variant, *overrides)
     if "encoder.backbone=[timm,scenes]" in overrides:

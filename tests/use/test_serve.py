@@ -214,7 +214,7 @@ def test_429_when_all_places_are_taken(client: TestClient, fake: FakeOctopi) -> 
     assert client.post(CHAT, json=body(ASK)).status_code == 200
 
 
-def test_addresses() -> None:
+def test_addresses_and_tokens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for host, token in (("localhost", ""), ("0.0.0.0", "x" * 16)):
         listen(host, 0, token).close()
     with listen("127.0.0.1", 0) as taken:
@@ -225,9 +225,6 @@ def test_addresses() -> None:
         ):
             with refused(words):
                 listen(host, port)
-
-
-def test_tokens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OCTOPI_TOKEN", " \n")
     assert read_token(None) == ""
     (file := tmp_path / "token").write_text(f" {'x' * 16}\n")
