@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("elsewhere")
 
 ONE = "model.safetensors"
 INDEX = "model.safetensors.index.json"
-CLIP_FILE, CLIP_FORM = "open_clip_model.safetensors", "open_clip_config.json"
+CLIP_FORM = "open_clip_config.json"
 WRITE: dict[str, Callable[[Path], Path]] = {
     "llama": write_llama,
     "shards": partial(write_llama, shard="20KB"),

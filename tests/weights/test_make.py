@@ -176,18 +176,12 @@ def patches_of(state: State, pairs: torch.Tensor) -> torch.Tensor:
     return tokens[:, REGISTERS:]
 
 
-def adopted(*files: str) -> Path:
-    """What is made of a download with the checkpoint in these files."""
-    Path("download").mkdir()
-    for name in files:
-        save_file(checkpoint(), f"download/{name}.safetensors")
-    Path("download/README.md").write_text("a card with its licence")
-    return adopt("sparsh", Path("download"), Path("sparsh"))
-
-
 @pytest.mark.usefixtures("elsewhere")
 def test_features_are_those_of_an_independent_forward_pass_of_the_same_picture_twice() -> None:
-    folder = adopted("dino_vitbase")
+    Path("download").mkdir()
+    save_file(checkpoint(), "download/dino_vitbase.safetensors")
+    Path("download/README.md").write_text("a card with its licence")
+    folder = adopt("sparsh", Path("download"), Path("sparsh"))
     assert {f.name for f in folder.iterdir()} == {"config.json", "model.safetensors", "README.md", "SHA256SUMS"}
     settings = {"recipe": "tuned", "backbone": ("timm",), "reference": "subtract", "feature_stage": DEPTH - 1}
     backbone = load_backbone(EncoderConfig.model_validate(settings | {"weights": str(folder)}), tuned=False)
