@@ -1,7 +1,5 @@
 """Made-up measurements and catalogues for the tests of the audit."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -14,13 +12,12 @@ from pipeline.scenes.light import make_sensor
 from pipeline.scenes.recipe import recipe_of
 from pipeline.scenes.render import make_scene, render
 from pipeline.videos.audit.leakage import check_leakage
-from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.records import Assignment, Finding, Probe, Severity
-from tests.closure import ROOT
+from tests.conftest import CATALOGUE as PHYSICLEAR
 from tests.frame_rules import scanned
 
 ERROR, WARNING, INFO = Severity.ERROR, Severity.WARNING, Severity.INFO
-PHYSICLEAR = load_catalogue(ROOT / "pipeline" / "physiclear")
 OBJECTS = ("baseball", "cotton_ball", "pillow", "potato", "rug", "millet", "lemon", "orange")
 GOOD_SPLIT = {o: (Part.TRAIN, Part.VALIDATION, Part.TEST)[i % 3] for i, o in enumerate(OBJECTS)}
 SCENE = ScenesConfig(frames=24, width=128, height=96)
@@ -37,20 +34,10 @@ def probe(video_id: str = "rug_0", **changes: object) -> Probe:
     file = {"session": "", "header_frames": 126, "frames": 126, "fps": 25.0, "width": 320, "height": 240}
     more = {"hdr": False, "rotation": 0, "irregular": 1.0, "kept": 37, "saturated": 0.0, "unsteady": 0}
     light = {"brightness": 90.0, "brightness_step": 0.4, "contact": 1.4, "quiet": 0.25, "contact_end": 0.3}
-    good: dict[str, object] = {
-        **file,
-        **more,
-        **light,
-        "video_id": video_id,
-        "object_id": video_id.rpartition("_")[0],
-        "path": f"{video_id}.mov",
-        "sha256": f"sha of {video_id}",
-        "starts_touching": False,
-        "untouched": (0, 2, 4, 6),
-        "thumbnail": tuple(rng.normal(90, 1, 6 * 8 * 3)),
-        "signature": tuple(contact / np.linalg.norm(contact)),
-    }
-    return Probe.model_validate({**good, **changes})
+    named = {"video_id": video_id, "object_id": video_id.rpartition("_")[0], "path": f"{video_id}.mov"}
+    own = {"sha256": f"sha of {video_id}", "starts_touching": False, "untouched": (0, 2, 4, 6)}
+    own |= {"thumbnail": tuple(rng.normal(90, 1, 144)), "signature": tuple(contact / np.linalg.norm(contact))}
+    return Probe.model_validate({**file, **more, **light, **named, **own, **changes})
 
 
 def probes(videos: int = 3, objects: Sequence[str] = OBJECTS) -> list[Probe]:
@@ -58,7 +45,6 @@ def probes(videos: int = 3, objects: Sequence[str] = OBJECTS) -> list[Probe]:
 
 
 def assigned(found: Sequence[Probe], parts: dict[str, Part]) -> list[Assignment]:
-    """Parts by video id, else by object."""
     return [
         Assignment(
             video_id=p.video_id, object_id=p.object_id, part=parts.get(p.video_id, parts.get(p.object_id, Part.UNUSED))

@@ -1,13 +1,17 @@
-"""Tiny random checkpoints in the formats of the real ones: open_clip's folder and transformers' folder."""
-
-from __future__ import annotations
+"""Tiny models in published layouts, ways to change their files, and the base models that are made once."""
 
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import torch
+from filelock import FileLock
 from safetensors.torch import load_file, save_file
+
+from pipeline.core.io import fingerprint
+from pipeline.weights.make import CATALOGUE, make
+from tests.closure import ROOT
 
 CLIP_CONFIG: dict[str, dict[str, Any]] = {
     "model_cfg": {
@@ -27,12 +31,10 @@ def edit(file: Path, **changes: Any) -> None:
 
 
 def cut(file: Path, by: int = 1) -> None:
-    """Take the last bytes of a file away."""
     file.write_bytes(file.read_bytes()[:-by])
 
 
 def replace(file: Path, name: str, value: torch.Tensor) -> None:
-    """Put another tensor into a safetensors file."""
     save_file(load_file(file) | {name: value}, file)
 
 
@@ -102,4 +104,19 @@ def write_vicuna(folder: Path, words: str, **shapes: object) -> Path:
     torch.manual_seed(0)
     model = LlamaForCausalLM(LlamaConfig(**(narrow | vicuna | shapes)))  # type: ignore[arg-type]
     model.half().save_pretrained(folder, max_shard_size="200KB")
+    return folder
+
+
+@cache
+def model_folder(name: str) -> Path:
+    """The folder of a base model, such as `smollm2` (a minute, and half a gigabyte) or `tiny-llama`; leave it as it is.
+
+    It is kept in pytest's cache under a hash of the code that makes it and of the packages' versions.
+    """
+    key = fingerprint(ROOT / "pipeline" / "weights", ROOT / "requirements.lock", CATALOGUE)
+    folder = ROOT / ".pytest_cache" / "weights" / key / name
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(folder.with_suffix(".lock")):
+        if not folder.is_dir():
+            make(name, folder)
     return folder

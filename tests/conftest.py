@@ -33,32 +33,32 @@ if TYPE_CHECKING:
     import torch
 
 ROOT = Path(__file__).parents[1]
+PHYSICLEAR = ROOT / "pipeline" / "physiclear"
+CATALOGUE = load_catalogue(PHYSICLEAR)
 DATA_VARIABLE = "OCTOPI_DATA_DIR"
-NO_DATA = f"needs real videos: set {DATA_VARIABLE} to a folder of the PhysiCLeAR videos"
 
 HUNG = 600.0
 """Seconds after which a test may take something for hung, however busy the machine is; nothing is measured by them."""
 
 # A loaded machine is no reason to fail, and a test that passes today passes tomorrow.
-settings.register_profile(
-    "house",
-    deadline=None,
-    derandomize=True,
-    database=None,
-    max_examples=60,
-    suppress_health_check=[HealthCheck.too_slow],
-)
+SAME = {"deadline": None, "derandomize": True, "database": None}
+settings.register_profile("house", **SAME, max_examples=60, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("house")
+
+
+def wait_for(condition: Callable[[], object]) -> None:
+    """Until it is true; fails where it never is."""
+    end = time.monotonic() + HUNG
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
 
 
 def wait_until_ended(processes: Iterable[psutil.Process]) -> None:
     """A zombie has ended, even where nobody fetches it; a process of the same number is another."""
-    end = time.monotonic() + HUNG
     for process in processes:
         with suppress(psutil.NoSuchProcess):
-            while process.is_running() and process.status() != psutil.STATUS_ZOMBIE:
-                assert time.monotonic() < end, f"{process} is alive"
-                time.sleep(0.02)
+            wait_for(lambda process=process: not process.is_running() or process.status() == psutil.STATUS_ZOMBIE)
 
 
 def not_utf8(folder: Path, name: str) -> Path:
@@ -77,6 +77,17 @@ def refused(words: str) -> Any:
     return pytest.raises(UserError, match=words, check=lambda error: "\n" not in str(error))
 
 
+def octopi(*words: object, status: int = 0) -> str:
+    """What `octopi WORDS...` prints; what it refuses is raised."""
+    from typer.testing import CliRunner
+
+    from pipeline.cli import app
+
+    done = CliRunner().invoke(app, [*map(str, words)], catch_exceptions=False)
+    assert done.exit_code == status, done.output
+    return done.output
+
+
 def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
     """Mark what `make test-fast` leaves out: the chain, benchmarks, files that start processes, the large model."""
     for item in items:
@@ -92,20 +103,18 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     if "torch" in sys.modules:
         sys.modules["torch"].manual_seed(67_280_421_310_721)  # As where it is imported later.
     if item.get_closest_marker("real") and not os.environ.get(DATA_VARIABLE):
-        pytest.skip(NO_DATA)
+        pytest.skip(f"needs real videos: set {DATA_VARIABLE} to a folder of the PhysiCLeAR videos")
 
 
 @pytest.fixture(scope="session")
 def real_data() -> Path:
-    """The folder of the real videos; skips where there is none, for tests marked `real`."""
-    if not os.environ.get(DATA_VARIABLE):
-        pytest.skip(NO_DATA)
+    """The folder of the real videos, for tests marked `real`."""
     return Path(os.environ[DATA_VARIABLE])
 
 
 @pytest.fixture(scope="session")
 def catalogue() -> Catalogue:
-    return load_catalogue(ROOT / "pipeline" / "physiclear")
+    return CATALOGUE
 
 
 @pytest.fixture(scope="session")
@@ -118,7 +127,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def smollm2_folder() -> Path:
     """SmolLM2-135M-Instruct in transformers' format; leave it as it is."""
-    from tests.models import model_folder
+    from tests.checkpoints import model_folder
 
     return model_folder("smollm2")
 
@@ -264,21 +273,15 @@ def tiny_videos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def few_permutations(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Few permutations in the audit of leakage, where they are not what is tested."""
     monkeypatch.setattr("pipeline.videos.audit.leakage.PERMUTATIONS", 50)
 
 
 def classified(
-    video_id: str,
-    name: str,
-    expected: int,
-    predicted: int,
-    probabilities: tuple[float, ...] = (1.0,),
-    part: Part = Part.TEST,
+    video_id: str, name: str, expected: int, predicted: int, shares: Sequence[float] = (1.0,), part: Part = Part.TEST
 ) -> Classification:
     """What a head said of a video, which is called after its object."""
     whose = {"video_id": video_id, "object_id": video_id.rpartition("_")[0], "part": part, "property": name}
-    return Classification(**whose, expected=expected, predicted=predicted, probabilities=probabilities)
+    return Classification(**whose, expected=expected, predicted=predicted, probabilities=tuple(shares))
 
 
 def fake_videos(objects: Iterable[str], per_object: int = 3) -> list[Video]:

@@ -1,7 +1,5 @@
 """What the tests of encoders share: tiny towers, frames as extraction leaves them, settings, comparisons."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -72,7 +70,6 @@ def config(weights: Path, recipe: RecipeName, **changes: object) -> EncoderConfi
 
 
 def training(data: EncoderData, setting: EncoderConfig, seed: int = 0, **more: Any) -> Training:
-    """A training on the CPU that depends on no other file."""
     return Training(data, setting, CPU, seed, (), **more)
 
 
@@ -105,7 +102,6 @@ def float64(tensor: torch.Tensor) -> Floats:
 
 
 def close(found: torch.Tensor, expected: Floats, rtol: float = 1e-5) -> None:
-    """Within float32's rounding, for the array as a whole."""
     assert found.dtype == torch.float32
     np.testing.assert_allclose(float64(found), expected, rtol=0, atol=rtol * max(1, np.abs(expected).max()))
 

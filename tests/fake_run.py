@@ -1,7 +1,5 @@
 """What the stages before the report leave on disk, made up: real formats, small, a second of work."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,9 +21,8 @@ from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.records import Assignment, Finding, Severity, Video
 from pipeline.videos.split import assign
 from pipeline.weights import is_random
-from tests.closure import ROOT
-from tests.conftest import classified
-from tests.models import model_folder
+from tests.checkpoints import model_folder
+from tests.conftest import ROOT, classified
 
 
 def fake_params(*overrides: str) -> Params:

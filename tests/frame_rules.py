@@ -1,7 +1,5 @@
 """Small videos, slow second implementations of the rules, and a place to extract frames to."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -63,8 +61,6 @@ def frames_of(path: Path) -> list[av.VideoFrame]:
 
 
 class Scanned(NamedTuple):
-    """What is kept of a video, and what is measured of it."""
-
     kept: tuple[Kept, ...]
     reference: np.ndarray
     probe: Probe
@@ -79,7 +75,6 @@ def scanned(path: Path, config: FramesConfig = CONFIG, video_id: str = "rug_0") 
 
 @contextmanager
 def promising(frames: int) -> Iterator[None]:
-    """Headers that promise so many frames."""
     init = Decoder.__init__
 
     def lying(self: Decoder, path: Path) -> None:
@@ -133,8 +128,6 @@ def pillow(image: np.ndarray, size: int, mode: str) -> np.ndarray:
 
 
 class Place:
-    """A folder of videos, and where its frames go."""
-
     def __init__(self, folder: Path, root: Path, catalogue: Catalogue) -> None:
         self.folder, self.catalogue = folder, catalogue
         self.out, self.partial, self.log = root / "out é", root / "partial", root / "decoded.txt"

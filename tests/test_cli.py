@@ -1,8 +1,5 @@
 """The command `octopi`: what a person sees, and the exit status."""
 
-from __future__ import annotations
-
-import csv
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -12,10 +9,8 @@ from typer.testing import CliRunner
 from pipeline.cli import app
 from pipeline.config.params import load_params
 from pipeline.scales import compose, write_params
-from tests.closure import ROOT
-from tests.conftest import moving_square, write_video
-
-RUNNER = CliRunner()
+from tests.conftest import ROOT, moving_square, octopi, write_video
+from tests.report.conftest import rows_of
 
 
 @pytest.fixture
@@ -28,11 +23,9 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_scale_writes_what_it_says(project: Path) -> None:
-    result = RUNNER.invoke(app, ["scale", "smoke", "ablation.seeds=[3]"])
-    assert result.exit_code == 0, result.output
-    assert "reports/smoke-scenes/" in result.output
+    assert "reports/smoke-scenes/" in octopi("scale", "smoke", "ablation.seeds=[3]")
     assert load_params().ablation.seeds == (3,)
-    assert "unchanged" in RUNNER.invoke(app, ["scale", "smoke", "ablation.seeds=[3]"]).output
+    assert "unchanged" in octopi("scale", "smoke", "ablation.seeds=[3]")
 
 
 def test_scale_names_the_objects_that_nothing_can_be_asked_about(project: Path) -> None:
@@ -46,9 +39,8 @@ def test_scale_names_the_objects_that_nothing_can_be_asked_about(project: Path) 
         (f"{learnt},{checked},{asked},toilet_brush_bristles", "seed=0", []),
         (f"{learnt},{checked}", "split.name=kfold", []),
     ):
-        result = RUNNER.invoke(app, ["scale", "smoke", f"scenes.objects=[{objects}]", "ablation.touch=[]", override])
-        assert result.exit_code == 0, result.output
-        assert [line for line in result.output.splitlines() if "have no videos" in line] == words
+        said = octopi("scale", "smoke", f"scenes.objects=[{objects}]", "ablation.touch=[]", override)
+        assert [line for line in said.splitlines() if "have no videos" in line] == words
 
 
 INNER = {
@@ -62,7 +54,7 @@ def test_ctrl_c_is_one_line(project: Path, monkeypatch: pytest.MonkeyPatch) -> N
     write_params(compose("smoke"))
     for command, inner in INNER.items():
         monkeypatch.setattr(inner, Mock(side_effect=KeyboardInterrupt))
-        result = RUNNER.invoke(app, command.split())
+        result = CliRunner().invoke(app, command.split())
         assert (result.exit_code, result.stdout) == (130, "")
         assert result.stderr == "octopi: stopped; what is finished stays, call it again to go on\n"
 
@@ -74,11 +66,11 @@ def test_a_clone_whose_chain_is_up_to_date_is_published_once(project: Path, monk
     monkeypatch.setattr("dvc.cli.main", lambda _: 0)
     monkeypatch.setattr("pipeline.tracking.publish.publish", calls.append)
     for arguments, published in ((["--dry"], 0), ([], 1)):
-        assert RUNNER.invoke(app, ["repro", *arguments]).exit_code == 0
+        octopi("repro", *arguments)
         assert len(calls) == published
     (project / "mlruns").mkdir()
     (project / "mlruns" / "mlflow.db").touch()
-    assert RUNNER.invoke(app, ["repro"]).exit_code == 0
+    octopi("repro")
     assert len(calls) == 1
 
 
@@ -86,7 +78,7 @@ def test_a_dry_run_lists_what_waits_where_outputs_are_missing(project: Path, mon
     write_params(compose("smoke"))
     monkeypatch.setattr("dvc.cli.main", lambda _: pytest.fail("it ends where a file is missing"))
     monkeypatch.setattr("pipeline.cli.reproduce.outdated", lambda _: (["split", "grade"], 16, False))
-    assert RUNNER.invoke(app, ["repro", "--dry"]).output.splitlines()[1:] == ["split", "grade"]
+    assert octopi("repro", "--dry").splitlines()[1:] == ["split", "grade"]
 
 
 def lines(output: str, severity: str) -> list[str]:
@@ -95,40 +87,36 @@ def lines(output: str, severity: str) -> list[str]:
 
 @pytest.fixture
 def folder(project: Path, few_permutations: None) -> Path:
-    """Two videos that decode."""
     for seed, name in enumerate(("baseball_0", "potato_0")):
         write_video(project / "videos" / f"{name}.avi", moving_square(8, seed))
     return project / "videos"
 
 
 def test_data_check_lists_every_error_first(folder: Path) -> None:
-    good = RUNNER.invoke(app, ["data", "check", str(folder)])
-    assert (good.exit_code, lines(good.output, "error")) == (0, [])
-    assert "resolution: 48x36: 2 videos" in good.output
-    assert "agreement" not in good.output, "labels and leaks are the audit's"
+    good = octopi("data", "check", folder)
+    assert lines(good, "error") == []
+    assert "resolution: 48x36: 2 videos" in good
+    assert "agreement" not in good, "labels and leaks are the audit's"
     (folder / "rug_0.avi").write_bytes(b"")
     (folder / "nameless.avi").write_bytes(b"x")
-    bad = RUNNER.invoke(app, ["data", "check", str(folder)])
-    assert bad.exit_code == 1
-    errors = lines(bad.output, "error")
-    assert bad.output.splitlines()[: len(errors)] == errors
+    bad = octopi("data", "check", folder, status=1)
+    errors = lines(bad, "error")
+    assert bad.splitlines()[: len(errors)] == errors
     assert [line.split(": ")[1] for line in errors] == ["nameless.avi", "rug_0.avi"]
 
 
 def test_data_audit_writes_all_it_shows_and_ends_with_status_1_where_parts_share_a_video(folder: Path) -> None:
     for status, severities in ((0, {"warning", "info"}), (1, {"error", "warning", "info"})):
-        result = RUNNER.invoke(app, ["data", "audit", "videos", "--split", "paper", "--out", "found/audit.csv"])
-        assert result.exit_code == status, result.output
-        with Path("found/audit.csv").open(newline="", encoding="utf-8") as stream:
-            rows = list(csv.DictReader(stream))
+        said = octopi("data", "audit", "videos", "--split", "paper", "--out", "found/audit.csv", status=status)
+        rows = rows_of(Path("found/audit.csv"))
         assert list(rows[0]) == ["check", "item", "measured", "expected", "severity"]
         assert {row["severity"] for row in rows} == severities
-        first, *shown = result.output.splitlines()
+        first, *shown = said.splitlines()
         assert first == f"{len(rows)} findings in found/audit.csv"
         for row, line in zip(rows, shown, strict=True):
             expected = f" (expected: {row['expected']})" if row["expected"] else ""
             assert line == f"{row['severity']:8} {row['check']}: {row['item']}: {row['measured']}{expected}"
         # A test object's video with the bytes of a training object's.
         (folder / "bath_towel_0.avi").write_bytes((folder / "baseball_0.avi").read_bytes())
-    assert len(lines(result.output, "error")) == 1
-    assert RUNNER.invoke(app, ["data", "audit", "videos"]).exit_code == 0, "without a split it is a warning"
+    assert len(lines(said, "error")) == 1
+    octopi("data", "audit", "videos")  # Without a split it is a warning.

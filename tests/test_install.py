@@ -1,7 +1,5 @@
 """What a person does with the folder: clone it on Windows, put it where a path has a space, move it."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import socket
@@ -11,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.checkpoints import model_folder
 from tests.closure import ROOT
-from tests.models import model_folder
 
 UV = f"""#!/bin/sh
 mkdir -p .venv/bin

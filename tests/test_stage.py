@@ -1,20 +1,20 @@
-"""Around a stage: one line for bad input, one process at a time, and the code beside it or none."""
-
-from __future__ import annotations
+"""Around a stage: one line for bad input, one process at a time, the code beside it; and files that appear whole."""
 
 import errno
 import json
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from filelock import FileLock
-from typer.testing import CliRunner
 
-from pipeline.cli import app
-from pipeline.core.records import Measurement
+from pipeline.core import io
+from pipeline.core.io import atomic, read_json, read_jsonl, read_table, write_json, write_jsonl, write_table
+from pipeline.core.records import Measurement, Part
+from pipeline.core.runtime import name_dtype, resolve_dtype
 from pipeline.encoder.embed import EncoderSource
 from pipeline.language.generate import ModelSource
 from pipeline.running import parallel
@@ -22,8 +22,9 @@ from pipeline.running.errors import UserError
 from pipeline.running.parallel import device_here, use_backend
 from pipeline.running.stage import running_stages, stage
 from pipeline.scales import check_inputs, compose, write_params
-from tests.closure import ROOT
-from tests.conftest import refused
+from pipeline.tasks.records import Score
+from pipeline.videos.records import Assignment, Video
+from tests.conftest import ROOT, octopi, refused
 
 
 def test_a_stage_says_when_it_starts_and_ends_and_what_it_cost(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -51,7 +52,6 @@ def test_a_stage_says_when_it_starts_and_ends_and_what_it_cost(here: Path, capsy
         (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate"), "lower the batch sizes"),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory"), "lower the batch sizes"),
         (OSError(errno.ENOSPC, "No space left on device", "data/x"), "data/x: No space left on device; free space"),
-        (PermissionError(errno.EACCES, "Permission denied", "data/x"), "data/x: Permission denied; "),
         # As safetensors and torch say it.
         (RuntimeError("I/O error: No space left on device (os error 28)"), "No space left on device; free"),
         (RuntimeError("basic_ios::clear: iostream error"), "data/ or checkpoints/: Input/output error"),
@@ -109,9 +109,8 @@ def test_no_scale_is_chosen_while_a_stage_runs(here: Path) -> None:
     before = (here / "params.yaml").read_bytes()
     with stage("split"):
         assert running_stages() == ["split"]
-        result = CliRunner().invoke(app, ["scale", "small"])
-    assert isinstance(result.exception, UserError)
-    assert "split is running" in str(result.exception)
+        with refused("split is running"):
+            octopi("scale", "small")
     assert (here / "params.yaml").read_bytes() == before
     assert running_stages() == []
 
@@ -153,9 +152,8 @@ def test_records_are_of_the_code_beside_them(clone: Path, monkeypatch: pytest.Mo
     refusals |= {clone.parent: f"{clone.parent} has no dvc.yaml; go to"}
     for folder, words in refusals.items():
         monkeypatch.chdir(folder)
-        error = CliRunner().invoke(app, command.split()).exception
-        assert isinstance(error, UserError)
-        assert words in str(error)
+        with refused(re.escape(words)):
+            octopi(*command.split())
     assert sorted(clone.rglob("*")) == before
 
 
@@ -164,7 +162,8 @@ def test_a_model_may_be_asked_in_any_folder(clone: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr("pipeline.use.model.Octopi.from_pretrained", lambda *_, **__: 1 / 0)
     for folder in (clone, clone / "pipeline/encoder", clone.parent):
         monkeypatch.chdir(folder)
-        assert isinstance(CliRunner().invoke(app, command.split()).exception, ZeroDivisionError), "it is reached"
+        with pytest.raises(ZeroDivisionError):  # It is reached.
+            octopi(*command.split())
 
 
 def test_a_worker_that_outlives_a_stage_loads_anew() -> None:
@@ -189,3 +188,65 @@ def test_a_backend_is_a_parameter_and_may_lack_its_package(here: Path, monkeypat
     write_params(params)
     with stage("split"):
         assert device_here("cuda") == "cpu", "the workers' is another"
+
+
+SCORE = Score(
+    question_id="q", task="PC", measure="choice", correct=True, parsed=True, truncated=False, expected="yes",
+    predicted="yes", objects=("a", "b"),
+)  # fmt: skip
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    target = tmp_path / "a.json"
+    write_json(target, {"old": 1})
+    with pytest.raises(RuntimeError), atomic(target) as temporary:  # noqa: PT012
+        temporary.write_text("half")
+        raise RuntimeError
+    with pytest.raises(ValueError, match="JSON"):
+        write_json(target, {"x": float("nan")})
+    assert read_json(target) == {"old": 1}
+    assert os.listdir(tmp_path) == ["a.json"]
+
+
+def test_tables_come_back_as_they_went(tmp_path: Path) -> None:
+    for model, records in (
+        (Score, [SCORE, SCORE.model_copy(update={"objects": ()})]),
+        (Assignment, [Assignment(video_id="ä b", object_id="x", part=Part.TEST)]),
+        (Assignment, []),
+        (Measurement, [Measurement(step=1, name="x", value=0.1), Measurement(step=2, name="x", value=5e-324)]),
+    ):
+        write_table(tmp_path / "t.parquet", model, records)
+        assert read_table(tmp_path / "t.parquet", model) == records
+        write_jsonl(tmp_path / "t.jsonl", records)
+        assert read_jsonl(tmp_path / "t.jsonl", model) == records
+
+
+def test_bad_files_are_named_with_the_mend(tmp_path: Path) -> None:
+    write_table(tmp_path / "t.parquet", Score, [SCORE])
+    (tmp_path / "q.jsonl").write_text(SCORE.model_dump_json() + "\n{}\n")
+    (tmp_path / "x.safetensors").write_bytes(b"\x80\x04 a pickle, say")
+    for words, read in (
+        ("t.parquet.*columns", lambda: read_table(tmp_path / "t.parquet", Video)),
+        ("q.jsonl.*line 2", lambda: read_jsonl(tmp_path / "q.jsonl", Score)),
+        ("x.safetensors.*not a safetensors file", lambda: io.load_tensors(tmp_path / "x.safetensors")),
+    ):
+        with refused(words):
+            read()
+
+
+@pytest.mark.skipif(not Path("/proc/cpuinfo").is_file(), reason="needs /proc/cpuinfo")
+def test_on_a_processor_auto_follows_its_instructions(monkeypatch: pytest.MonkeyPatch) -> None:
+    flags = {flag for line in Path("/proc/cpuinfo").read_text().splitlines() for flag in line.split()}
+    assert name_dtype("auto", "cpu") == ("bfloat16" if flags & {"avx512_bf16", "amx_bf16"} else "float32")
+    for avx, amx, name in ((False, False, "float32"), (True, False, "bfloat16"), (False, True, "bfloat16")):
+        monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda avx=avx: avx)
+        monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda amx=amx: amx)
+        assert name_dtype("auto", "cpu") == name
+
+
+@pytest.mark.parametrize("capable", [True, False])
+def test_on_a_card_auto_follows_the_card(capable: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: capable)
+    assert name_dtype("auto") == name_dtype("auto", "cuda") == ("bfloat16" if capable else "float32")
+    assert resolve_dtype("auto") is getattr(torch, name_dtype("auto"))

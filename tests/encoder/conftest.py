@@ -1,7 +1,5 @@
 """What several tests of encoders share."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -55,8 +53,6 @@ def relabelled(data: EncoderData, object_id: str) -> EncoderData:
 
 
 def killed_at(updates: Collection[int], begun: list[int]) -> Callable[[int, torch.optim.Optimizer], None]:
-    """Dies at these updates; keeps all that were begun."""
-
     def kill(number: int, _: torch.optim.Optimizer) -> None:
         begun.append(number)
         if number in updates:
@@ -73,6 +69,5 @@ def data(catalogue: Catalogue, tmp_path: Path) -> EncoderData:
 
 @pytest.fixture
 def few_fits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Few heads are fitted to choose among, where they are not what is tested."""
     monkeypatch.setattr(frame_classifier, "STRENGTHS", (1e-3, 1e-2))
     monkeypatch.setattr(frame_classifier, "FOLDS", 2)

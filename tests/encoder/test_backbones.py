@@ -1,7 +1,5 @@
 """Backbones: what they compute against timm's own features, what is tuned of them, and training above cached trunks."""
 
-from __future__ import annotations
-
 import json
 import sys
 from dataclasses import replace
@@ -189,7 +187,6 @@ def test_training_above_trunks_trains_as_on_frames(timm_folder: Path, data: Enco
 
 
 def test_flips_are_drawn_by_seed_epoch_and_video(timm_folder: Path, data: EncoderData) -> None:
-    """Each of the four a quarter of the time; without a seed none."""
     videos, encoder = data.videos(Part.TRAIN), side_by_side(timm_folder)
     trunks = run_trunks(encoder, data, videos, DEVICE, mirrored=True)
     frames = ClipDataset(data.store, videos, per_video=2)[0]["frames"]

@@ -1,7 +1,5 @@
 """The per-frame classifier: fitted heads against scikit-learn, decisions against all combinations."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """What the recipes compute, against towers and heads that are written anew here, in float64."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -143,7 +141,6 @@ def test_encoders_are_the_tower_with_prompts(
 
 
 def test_the_class_token_is_read_where_it_is_named(frames: torch.Tensor, tmp_path: Path) -> None:
-    """By `paper`, normalised; `release` reads it whatever is named."""
     weights, pictures, indices = write_tower(tmp_path), frames[:, 0], FRAME_INDICES[:, 0]
     tower, encoder = Tower(weights), base_encoder(config(weights, "paper", embedding="class_token"))
     assert encoder.dim == 32

@@ -1,7 +1,5 @@
 """Synthetic pictures: each follows from seed and number alone, says what is so of its object, and survives kills."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import os
@@ -65,7 +63,6 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> SyntheticPictures:
 
 @pytest.mark.slow
 def test_an_object_follows_from_seed_and_number_alone(drawn: SyntheticPictures) -> None:
-    """Whatever else the settings say, whatever was drawn before, and whether others are."""
     other = PretrainConfig(objects=5000, presses=2, seed=5, steps=7, batch_size=1, augment=False)
     for number in (8, 0):
         np.random.seed(number)

@@ -1,7 +1,5 @@
 """Training of encoders, the clips that they are shown, what is saved of them, and the registry of recipes."""
 
-from __future__ import annotations
-
 import itertools
 import random
 from collections.abc import Iterable, Sequence
@@ -18,7 +16,6 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.preprocessing import StandardScaler
 from transformers import TrainerCallback
 
-from pipeline.config import RecipeName
 from pipeline.core.layout import PRETRAINED
 from pipeline.core.records import Embedding, Flip, Part
 from pipeline.core.runtime import derive_seed, seed_everything
@@ -128,12 +125,7 @@ def test_autocast_computes_in_bfloat16_and_learns_in_float32(weights: Path, data
     ],
 )
 def test_the_first_of_the_best_epochs_is_kept(
-    kind: RecipeName,
-    scores: Sequence[float],
-    kept: int,
-    weights: Path,
-    data: EncoderData,
-    monkeypatch: pytest.MonkeyPatch,
+    kind: str, scores: Sequence[float], kept: int, weights: Path, data: EncoderData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not scores:
         data = replace(data, assignments=[a.model_copy(update={"part": Part.TRAIN}) for a in data.assignments])

@@ -1,7 +1,5 @@
 """Trainings of encoders that go wrong: classes that lack, NaN, rates that are too high, kills, too few objects."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -66,7 +64,6 @@ class Sick(FrameEncoder):
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 def test_what_is_not_finite_is_named(value: float, weights: Path, catalogue: Catalogue, tmp_path: Path) -> None:
-    """Embeddings, and logits in batches of any size."""
     data = encoder_data(tmp_path, catalogue, PARTS, per_video=4)
     pixels = np.load(tmp_path / "frames.npy")
     pixels[data.store.rows("pillow_0")[-1]] = 255
@@ -229,7 +226,6 @@ def test_a_tiny_pretraining_draws_trains_and_tells_what_it_left_aside() -> None:
 def test_a_training_goes_on_only_with_its_own_settings_labels_and_objects(
     weights: Path, data: EncoderData, versions: Callable[[str], None], begun_in: Begun
 ) -> None:
-    """Else a model would be tested on objects that it learnt from, or keep what it learnt of a wrong label."""
     rated = data.assignments[0].object_id
     exchanged = [a.model_copy(update={"part": Part.TEST}) if a.object_id == rated else a for a in data.assignments]
     usual = begun_in(lambda: trained("paper", weights, data))

@@ -1,19 +1,14 @@
 """Made-up questions and answers that several tests of evaluation share."""
 
-from __future__ import annotations
-
 import itertools
+from typing import Any
 
 from hypothesis import strategies as st
 
-from pipeline.core.records import Encoder, Lora, Opd, TouchInput
 from pipeline.evaluation.intervals import Objects
 from pipeline.evaluation.records import Graded
-from pipeline.videos.catalogue import load_catalogue
-from tests.closure import ROOT
 
 About = tuple[Objects, ...]
-CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
 OBJECTS = [f"object{i}" for i in range(6)]
 PAIRS = list(itertools.combinations(OBJECTS, 2))
 
@@ -27,30 +22,18 @@ def designs(draw: st.DrawFn) -> About:
 
 
 def single(objects: int, each: int) -> About:
-    """So many questions about each of so many objects."""
     return tuple((f"{o:02}",) for o in range(objects) for _ in range(each))
 
 
 def graded(
-    task: str,
-    right: list[bool],
-    *,
-    encoder: str = "finetuned",
-    lora: str = "with",
-    opd: str = "all",
-    seed: int = 0,
-    touch: str = "real",
-    measure: str = "choice",
-    unread: int = 0,
-    objects: list[tuple[str, ...]] | None = None,
+    task: str, right: list[bool], *, measure: str = "choice", unread: int = 0, objects: Any = None, **system: Any
 ) -> list[Graded]:
-    """One answer a question; the last `unread` could not be read."""
+    """One answer a question of the full system, or of another; the last `unread` could not be read."""
     about = objects or (PAIRS if measure == "choice" else [(o,) for o in OBJECTS] * 3)
-    whose = {"encoder": Encoder(encoder), "lora": Lora(lora), "opd": Opd(opd), "touch": TouchInput(touch)}
-    whose |= {"task": task, "measure": measure, "seed": seed, "trained": seed}
-    whose |= {"truncated": False, "expected": "a", "predicted": ""}
+    whose = {"encoder": "finetuned", "lora": "with", "opd": "all", "touch": "real", "seed": 0} | system
+    whose |= {"trained": whose["seed"], "task": task, "measure": measure, "truncated": False, "expected": "a"}
     read = [i < len(right) - unread for i in range(len(right))]
     return [
-        Graded(question_id=f"{task}-{i:03}", correct=right[i], parsed=read[i], objects=about[i], **whose)
-        for i in range(len(right))
+        Graded(question_id=f"{task}-{i:03}", correct=own, parsed=read[i], objects=about[i], predicted="", **whose)
+        for i, own in enumerate(right)
     ]

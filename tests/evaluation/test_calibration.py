@@ -1,6 +1,4 @@
-"""Temperatures and calibration errors against sums by hand, and against what they must be by construction."""
-
-from __future__ import annotations
+"""Temperatures and calibration errors against sums by hand; maps of embeddings keep what is near."""
 
 import numpy as np
 import pytest
@@ -12,7 +10,9 @@ from scipy.special import softmax
 from pipeline.core.records import Part
 from pipeline.encoder.records import Classification
 from pipeline.evaluation.calibration import calibration_error, calibration_rows, fit_temperature, rescale
-from tests.conftest import classified
+from pipeline.evaluation.maps import map_frame
+from pipeline.videos.records import Assignment
+from tests.conftest import CATALOGUE, classified
 
 
 def said(expected: int, *probabilities: float, object_id: str = "rug") -> Classification:
@@ -34,11 +34,6 @@ def test_error_by_hand() -> None:
     assert calibration_error(answers) == pytest.approx(0.5 * 0.075 + 0.5 * 0.43)
     assert calibration_error([said(0, 1.0, 0.0)]) == pytest.approx(0, abs=1e-9)
     assert calibration_error([said(1, 1.0, 0.0)]) == pytest.approx(1)
-
-
-@pytest.mark.parametrize("temperature", [0.5, 1.0, 3.0])
-def test_finds_the_temperature_that_answers_were_made_by(temperature: float) -> None:
-    assert fit_temperature(drawn(2000, temperature)) == pytest.approx(temperature, rel=0.1)
 
 
 def test_minimum_is_where_the_slope_vanishes() -> None:
@@ -85,3 +80,33 @@ def test_rows_have_the_temperature_of_their_own_encoder() -> None:
     assert row.without_temperature == pytest.approx(calibration_error(tested), abs=1e-6)
     assert row.error < 0.04 < 0.08 < row.without_temperature
     assert calibration_rows([]) == []
+
+
+def videos(objects: int, each: int) -> list[Assignment]:
+    names = list(CATALOGUE.objects)[:objects]
+    return [Assignment(video_id=f"{o}_{i}", object_id=o, part=Part.TEST) for o in names for i in range(each)]
+
+
+@pytest.mark.parametrize("count", [2, 3, 40])
+def test_a_map_has_each_video_once_a_method_and_keeps_clusters_apart(count: int) -> None:
+    tested = videos(count, 1)
+    far = 20.0 * (np.arange(len(tested)) % 2)
+    features = np.random.default_rng(0).normal(size=(len(tested), 8)) + far[:, None]
+    found = map_frame(features, tested, CATALOGUE)
+    assert found.equals(map_frame(features, tested, CATALOGUE)), "the same each time"
+    for _, rows in found.groupby("method"):
+        assert sorted(rows["video_id"]) == sorted(v.video_id for v in tested)
+        assert np.isfinite(rows[["x", "y"]].to_numpy()).all()
+        if count >= 40:
+            places = rows[["x", "y"]].to_numpy()
+            apart = np.linalg.norm(places[:, None] - places[None], axis=2) + np.where(np.eye(len(rows)), np.inf, 0)
+            assert (far[apart.argmin(1)] == far).all()
+
+
+def test_of_many_videos_a_map_has_some_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.evaluation.maps.MAPPED", 40)
+    tested = videos(20, 3)
+    found = map_frame(np.random.default_rng(0).normal(size=(60, 3)), tested, CATALOGUE)
+    shown = found[found["method"] == "PCA"]
+    assert len(shown) == 40
+    assert shown["video_id"].str.rpartition("_")[0].nunique() == 20

@@ -1,7 +1,5 @@
 """`octopi diff` in a small Git and DVC repository: what it names, what it leaves out, and its paired test."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import re
@@ -13,13 +11,11 @@ from pathlib import Path
 
 import pytest
 from dvc.repo import Repo
-from typer.testing import CliRunner
 
-from pipeline.cli import app
 from pipeline.cli.diff import compare
 from pipeline.core.io import write_table
 from pipeline.evaluation.records import Graded
-from tests.conftest import refused
+from tests.conftest import octopi, refused
 from tests.evaluation.conftest import graded
 
 REPORT = "reports/smoke-scenes"
@@ -102,7 +98,6 @@ def history(tmp_path_factory: pytest.TempPathFactory) -> History:
 
 @pytest.fixture
 def copy(history: History, tmp_path: Path) -> History:
-    """One to change."""
     return History(shutil.copytree(history.folder, tmp_path / "copy", symlinks=True))
 
 
@@ -174,9 +169,7 @@ def test_an_address_is_shown_without_its_password(copy: History) -> None:
     assert "S3cret" not in found
 
 
-def test_an_unknown_revision_or_folder_is_refused(
-    history: History, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unknown_revisions_are_refused(history: History, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for revision in ("nowhere", "--all", "HEAD:params.yaml", "first..again"):
         with refused(f"^{revision}: no commit of a Git repository"):
             compare(history.folder, revision)
@@ -187,15 +180,13 @@ def test_an_unknown_revision_or_folder_is_refused(
 
 def test_what_a_person_sees(history: History, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(history.folder)
-    same = CliRunner().invoke(app, ["diff", "first", "again"])
-    assert (same.exit_code, same.output.strip()) == (0, "No parameter, metric or answer differs")
+    assert octopi("diff", "first", "again").strip() == "No parameter, metric or answer differs"
     file = tmp_path / "out" / "compared.json"
-    other = CliRunner().invoke(app, ["diff", "again", "longer", "--json", str(file)])
-    assert other.exit_code == 0, other.output
+    told = octopi("diff", "again", "longer", "--json", file)
     for words in (r"epochs +4 +5", r"smoke-scenes\.OPD +0\.25 +0\.75", r"finetuned with all real +new - old +OPD"):
-        assert re.search(words, other.output), words
+        assert re.search(words, told), words
     history.git("update-ref", "refs/exps/ab/cdef/odd-name", "longer")
-    assert re.search(r"epochs +4 +5", CliRunner().invoke(app, ["diff", "again", "odd-name"]).output)
+    assert re.search(r"epochs +4 +5", octopi("diff", "again", "odd-name"))
     written = json.loads(file.read_text())
     assert written["differs"] is True
     assert written["tested"][0]["task"] == "OPD"

@@ -1,36 +1,27 @@
 """Questions that others answer: what is exported, what is taken back, and what it says in a report."""
 
-from __future__ import annotations
-
 import json
 import runpy
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from pipeline.cli import app
 from pipeline.core.io import read_jsonl
 from pipeline.core.layout import questions_file
 from pipeline.core.records import Opd, Question
 from pipeline.report.load import load_report
 from pipeline.tasks import TASKS
-from tests.closure import ROOT
-from tests.conftest import refused
+from tests.conftest import ROOT, octopi, refused
 from tests.fake_run import fake_params, write_run
 
 FEW = ("ablation.encoders=[finetuned]", "ablation.touch=[]", "questions.evaluation={opd:4,pc:4,pss:4,pom:4,psr:4}")
-
-
-def questions(*arguments: str) -> str:
-    return CliRunner().invoke(app, ["questions", *arguments], catch_exceptions=False).output
 
 
 @pytest.mark.slow
 def test_right_answers_are_right_and_no_answer_leaves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     params = write_run(tmp_path, fake_params(*FEW))
-    assert "questions" in questions("export", "asked.jsonl")
+    assert "questions" in octopi("questions", "export", "asked.jsonl")
     asked = [json.loads(line) for line in Path("asked.jsonl").read_text().splitlines()]
     built = {q.question_id: q for q in read_jsonl(questions_file(0), Question)}
     assert [row["id"] for row in asked] == [*built]
@@ -44,7 +35,7 @@ def test_right_answers_are_right_and_no_answer_leaves(tmp_path: Path, monkeypatc
         assert not any(turn.assistant in json.dumps(row) for turn in dialogue.turns)
         told.append({"id": row["id"], "text": dialogue.turns[-1].assistant})
     Path("told.jsonl").write_text("\n".join(map(json.dumps, told)))
-    assert f"{len(built)} answers" in questions("grade", "told.jsonl", "--name", "their-model")
+    assert f"{len(built)} answers" in octopi("questions", "grade", "told.jsonl", "--name", "their-model")
     for stage in ("grade", "report"):
         runpy.run_path(str(ROOT / "stages" / f"{stage}.py"), run_name="__main__")
     report = load_report(Path("reports") / params.report_name)
@@ -57,7 +48,7 @@ def test_right_answers_are_right_and_no_answer_leaves(tmp_path: Path, monkeypatc
     def wrong(*lines: object) -> None:
         text = "\n".join(line if isinstance(line, str) else json.dumps(line) for line in lines)
         Path("wrong.jsonl").write_text(text)
-        questions("grade", "wrong.jsonl", "--name", "other")
+        octopi("questions", "grade", "wrong.jsonl", "--name", "other")
 
     with refused(rf"{told[-1]['id']} has no answer \(1 question in all"):
         wrong(*told[:-1])
@@ -70,7 +61,7 @@ def test_right_answers_are_right_and_no_answer_leaves(tmp_path: Path, monkeypatc
     with refused("3 texts for"):
         wrong({**told[0], "text": ["a", "b", "c"]}, *told[1:])
     with refused("--name a/b"):
-        questions("grade", "told.jsonl", "--name", "a/b")
+        octopi("questions", "grade", "told.jsonl", "--name", "a/b")
     with refused("nowhere.jsonl: cannot be read"):
-        questions("grade", "nowhere.jsonl", "--name", "other")
+        octopi("questions", "grade", "nowhere.jsonl", "--name", "other")
     assert [folder.name for folder in Path("external", params.report_name).iterdir()] == ["their-model"]

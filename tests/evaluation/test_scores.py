@@ -1,7 +1,5 @@
 """The rows of scores.csv and effects.csv, from made-up answers that are counted by hand."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +16,8 @@ from pipeline.evaluation.rows import EffectRow, ScoreRow
 from pipeline.evaluation.scores import effect_rows, score_rows, with_holm
 from pipeline.tasks import TASKS
 from pipeline.tasks.records import Score
-from tests.conftest import classified
-from tests.evaluation.conftest import CATALOGUE, PAIRS, graded
+from tests.conftest import CATALOGUE, classified
+from tests.evaluation.conftest import PAIRS, graded
 
 RNG = np.random.default_rng(1)
 
@@ -54,8 +52,6 @@ def test_one_seed_and_all_of_them() -> None:
 
 
 def test_tasks_and_measures_come_from_the_registry(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Their order, their chance; a task that is registered later appears by itself."""
-
     class Later(type(TASKS["PC"])):  # type: ignore[misc]
         name, measure = "LATER", "shape"
 
@@ -123,7 +119,6 @@ def test_effects_are_the_full_system_less_one_part() -> None:
 
 
 def test_training_is_compared_with_the_most_ratings() -> None:
-    """On the same questions; with the language model that was adapted, not with its heads and rules."""
     full, few, most, rules = drawn(), drawn(), drawn(), drawn()
     own = set(Score.model_fields)
     ways = ((few, 3, Shown.TOUCH), (most, 20, Shown.TOUCH), (rules, 20, Shown.CLASSES))
@@ -138,7 +133,6 @@ def test_training_is_compared_with_the_most_ratings() -> None:
 
 
 Classes = tuple[int, int, int]
-ABOUT = [("a",), ("a",), ("b",), ("c",)]
 
 
 def heads(part: Part, predicted: dict[str, Classes], expected: Classes) -> list[Classification]:
@@ -158,7 +152,7 @@ def test_property_heads_on_test_and_on_validation_videos() -> None:
     assert [found[name].accuracy for name in names] == [0.75, 0.5, 1, 0.5]
     assert {(r.n, r.encoder, r.lora, r.opd, r.touch) for r in found.values()} == {(4, "finetuned", "", "", "real")}
     assert found["combined"].chance == pytest.approx(1 / 27, abs=1e-6)
-    interval = accuracy_interval(np.array([1.0, 0, 0, 1]), ABOUT)
+    interval = accuracy_interval(np.array([1.0, 0, 0, 1]), [("a",), ("a",), ("b",), ("c",)])
     assert (found["combined"].low, found["combined"].high) == pytest.approx(interval, abs=1e-6)
     assert row(rows, task="heads_validation", measure="combined", seed="all").n == 1
 

@@ -1,7 +1,5 @@
 """What tests of the language side share: a tiny Llama, questions in real wording, embeddings of noise, references."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,16 +18,14 @@ from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.training import trainer
 from pipeline.training.embeddings import FLIPS, EmbeddingStore
 from pipeline.training.trainer import Trained
-from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.records import Assignment
 from tests.checkpoints import write_llama
-from tests.conftest import ROOT
+from tests.conftest import CATALOGUE
 
 FRAMES, DIM = 2, 6
-CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
 
 
-def write_store(folder: Path, frames: Sequence[tuple[str, int, str]], tensor: torch.Tensor) -> EmbeddingStore:
+def stored(folder: Path, frames: Sequence[tuple[str, int, str]], tensor: torch.Tensor) -> EmbeddingStore:
     """Embeddings of these frames: their videos, their places and how they are flipped."""
     index = [Embedding(video_id=v, frame_index=f, flip=flip, row=row) for row, (v, f, flip) in enumerate(frames)]
     write_table(folder / INDEX_FILE, Embedding, index)
@@ -47,7 +43,6 @@ def generation(batch_size: int, tokens: int = 12) -> LanguageConfig:
 
 
 def taking(samples: int, **own: float | str) -> LoraTrainConfig:
-    """Settings that take so many questions."""
     return LoraTrainConfig(samples=samples, **own)
 
 
@@ -76,7 +71,6 @@ def adapted(model: OctopiForCausalLM, config: LoraTrainConfig = LORA) -> OctopiF
 
 
 def call(model: OctopiForCausalLM) -> dict[str, torch.Tensor]:
-    """A question about two frames."""
     ids = torch.tensor([[5, model.start_id, model.frame_id, model.frame_id, model.end_id, 7, 9]])
     return {"input_ids": ids, "features": torch.randn(1, 2, DIM, generator=torch.manual_seed(3))}
 
@@ -122,12 +116,11 @@ def store(tmp_path_factory: pytest.TempPathFactory, questions: list[Question]) -
     folder = tmp_path_factory.mktemp("embeddings")
     videos = sorted({v for q in questions for v in q.videos})
     frames = [(v, f, flip) for v in videos for flip in FLIPS for f in range(3)]
-    return write_store(folder, frames, torch.randn(len(frames), DIM, generator=torch.manual_seed(0)))
+    return stored(folder, frames, torch.randn(len(frames), DIM, generator=torch.manual_seed(0)))
 
 
 @pytest.fixture(scope="session")
 def held(language: LanguageConfig, questions: list[Question], store: EmbeddingStore) -> Material:
-    """All of it, to train with."""
     return material(language, questions, store)
 
 
@@ -139,6 +132,5 @@ def model(language: LanguageConfig) -> OctopiForCausalLM:
 
 @pytest.fixture
 def checkpoints(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where trainings keep theirs."""
     monkeypatch.setattr("pipeline.training.trainer.CHECKPOINTS", tmp_path)
     return tmp_path

@@ -1,7 +1,5 @@
 """A process of a sharded training: `accelerate launch -m tests.language.sharded FOLDER WEIGHTS EMBEDDINGS WHAT`."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import signal

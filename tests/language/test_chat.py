@@ -3,8 +3,6 @@
 The reference is transformers' own: the same format written with its `generation` blocks, whose tokens it marks.
 """
 
-from __future__ import annotations
-
 import io
 from contextlib import suppress
 from datetime import date
@@ -99,9 +97,7 @@ TALKS = st.lists(TURNS, min_size=1, max_size=3).map(tuple)
 
 @settings(max_examples=30)
 @given(turns=TALKS | st.sampled_from([PSR, PSR[:1]]), system=st.sampled_from(["", "Be kind."]))
-def test_any_text_is_asked_as_it_was_trained(
-    spoken: tuple[PreTrainedTokenizerBase, str], turns: tuple[Turn, ...], system: str
-) -> None:
+def test_any_text_as_trained(spoken: tuple[PreTrainedTokenizerBase, str], turns: tuple[Turn, ...], system: str) -> None:
     """Labels are those of transformers, one end token an answer, and prompts begin the conversation."""
     tokenizer, template = spoken
     how = {"system_prompt": system, "frames": 5}
@@ -162,7 +158,7 @@ def knows_all(request: pytest.FixtureRequest) -> PreTrainedTokenizerFast:
 @pytest.mark.parametrize("family", FAMILIES)
 @settings(max_examples=20)
 @given(talk=TALKS)
-def test_what_a_template_writes_before_an_answer_is_asked_and_not_learnt(
+def test_a_templates_lead_is_not_learnt(
     family: str, knows_all: PreTrainedTokenizerFast, talk: tuple[Turn, ...]
 ) -> None:
     """Before each answer alike, in training and in every prompt, against the format written by hand."""

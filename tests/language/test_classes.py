@@ -1,18 +1,17 @@
 """Classes read from logits, held against the rules as reports grade them."""
 
-from __future__ import annotations
-
+import numpy as np
 import pytest
 import torch
 from scipy.special import softmax
 
-from pipeline.core.records import Part, Question
-from pipeline.encoder.records import Classification
+from pipeline.core.records import Question
 from pipeline.evaluation.grading import conclude
 from pipeline.language.classes import uncontradicted
 from pipeline.tasks.questions import build_questions
 from pipeline.training.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
-from tests.language.conftest import write_store
+from tests.conftest import classified
+from tests.language.conftest import stored
 from tests.tasks.shared import CATALOGUE, POOL
 
 ASKED = {"OPD": 20, "PC": 60, "PSS": 60, "POM": 90}
@@ -40,28 +39,20 @@ def store(logits: dict[str, torch.Tensor], tmp_path_factory: pytest.TempPathFact
     folder = tmp_path_factory.mktemp("logits")
     frames = [(video, frame, "none") for video in logits for frame in range(3)]
     mean, scale = torch.linspace(-4, 4, 9).double(), torch.linspace(0.2, 5, 9).double()
-    store = write_store(folder, frames, ((torch.cat([*logits.values()]) - mean) / scale).float())
+    store = stored(folder, frames, ((torch.cat([*logits.values()]) - mean) / scale).float())
     Statistics(mean, scale).save(folder / STATISTICS_FILE)
     return store
 
 
-def shares(frames: torch.Tensor, place: int) -> list[float]:
-    return [float(p) for p in softmax(frames[:, 3 * place : 3 * place + 3].numpy(), axis=1).mean(0)]
+def shares(frames: torch.Tensor, place: int) -> tuple[float, ...]:
+    return tuple(softmax(frames[:, 3 * place : 3 * place + 3].numpy(), axis=1).mean(0).tolist())
 
 
 def test_comparisons_stay_that_follow_from_the_logits_by_rule(
     questions: list[Question], logits: dict[str, torch.Tensor], store: EmbeddingStore
 ) -> None:
     said = [
-        Classification(
-            video_id=video,
-            object_id=video.rpartition("_")[0],
-            part=Part.TRAIN,
-            property=prop.name,
-            expected=0,
-            predicted=max(range(3), key=shares(frames, place).__getitem__),
-            probabilities=tuple(shares(frames, place)),
-        )
+        classified(video, prop.name, 0, int(np.argmax(own := shares(frames, place))), own)
         for video, frames in logits.items()
         for place, prop in enumerate(CATALOGUE.properties)
     ]

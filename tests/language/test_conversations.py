@@ -1,6 +1,4 @@
-"""Conversations: training and evaluation see the same text, only answers carry labels, batches hold like lengths."""
-
-from __future__ import annotations
+"""Conversations, of which only answers carry labels, batches that hold like lengths, and the projection's start."""
 
 import random
 from dataclasses import replace
@@ -13,17 +11,20 @@ import torch
 from accelerate.data_loader import BatchSamplerShard
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch.nn import functional as F
 from torch.utils.data import BatchSampler
 
 from pipeline.core.io import read_table, save_tensors
-from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Embedding, Turn
+from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Embedding, Question, Turn
 from pipeline.core.runtime import derive_seed
+from pipeline.language.begin import begin_with_words
 from pipeline.language.conversations import FILLER, UpdateSampler
 from pipeline.language.generate import write_prompt
 from pipeline.language.training import Material, assemble
 from pipeline.training.embeddings import EmbeddingStore
+from tests.checkpoints import write_llama
 from tests.conftest import refused
-from tests.language.conftest import FRAMES, generation, taking
+from tests.language.conftest import CATALOGUE, DIM, FRAMES, generation, stored, taking
 
 
 def test_without_a_begin_token_all_else_is_the_same(held: Material) -> None:
@@ -47,9 +48,7 @@ def test_without_a_begin_token_all_else_is_the_same(held: Material) -> None:
     st.sampled_from([1, 2, 4]),
     st.integers(0, 3),
 )
-def test_an_update_has_the_same_questions_on_any_number_of_devices(
-    lengths: list[int], micro: int, rounds: int, devices: int, epoch: int
-) -> None:
+def test_updates_are_equal_on_any_device(lengths: list[int], micro: int, rounds: int, devices: int, epoch: int) -> None:
     """Those of a random order, as accelerate deals them; in a last update that is too small fillers take part."""
     update = micro * rounds * devices
     data = SimpleNamespace(lengths=lengths, epoch=epoch)
@@ -93,10 +92,7 @@ def test_given_descriptions_are_not_learnt_and_stand_beside_other_touches(share:
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_an_embedding_that_is_not_finite_is_named_by_its_video(
-    value: float, store: EmbeddingStore, tmp_path: Path
-) -> None:
-    """Training and answering read embeddings through the store alone."""
+def test_an_embedding_that_is_not_finite_names_its_video(value: float, store: EmbeddingStore, tmp_path: Path) -> None:
     (tmp_path / INDEX_FILE).write_bytes((store.folder / INDEX_FILE).read_bytes())
     entry = read_table(store.folder / INDEX_FILE, Embedding)[-1]
     tensor = store.tensor.clone()
@@ -104,3 +100,42 @@ def test_an_embedding_that_is_not_finite_is_named_by_its_video(
     save_tensors(tmp_path / TENSOR_FILE, {TENSOR: tensor})
     with refused(f"safetensors: {entry.video_id} has an embedding that is not finite.*dvc repro"):
         EmbeddingStore(tmp_path)
+
+
+def felt(labels: tuple[int, ...], drawn: torch.Generator) -> torch.Tensor:
+    """An embedding that tells all classes, and noise."""
+    values = torch.tensor(labels, dtype=torch.float32) - 1
+    clean = torch.cat([1.2 * values, 2 * (values.square() - 2 / 3)])
+    return clean + 0.05 * torch.randn(DIM, generator=drawn)
+
+
+@pytest.mark.parametrize("kind", ["Llama", "Llama, normalized", "Gemma"])
+def test_frames_read_like_the_words_of_their_classes(
+    kind: str, held: Material, questions: list[Question], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kind, _, normalize = kind.partition(", ")
+    base = str(write_llama(tmp_path / "base", kind=kind))
+    labels = {v: label for q in questions for v, label in zip(q.videos, q.gold.labels, strict=True)}
+    drawn = torch.Generator().manual_seed(0)
+    frames = [(v, f, "none") for v in sorted(labels) for f in range(3)]
+    store = stored(tmp_path, frames, torch.stack([felt(labels[v], drawn) for v, _, _ in frames]))
+    language = held.language.model_copy(update={"normalize_touch": bool(normalize), "weights": base})
+    monkeypatch.setattr("pipeline.language.begin.STEPS", 250)
+    model, data = assemble(replace(held, language=language, store=store), taking(14), "test")
+    begin_with_words(model, data, CATALOGUE, seed=1)
+    assert all(p.grad is None for p in model.parameters())
+
+    words = model.llm.get_input_embeddings()(torch.arange(260))
+    seen = sorted({label for q in data.questions for label in q.gold.labels})
+    assert len(seen) > 4
+    means = torch.zeros(len(seen), words.shape[1])
+    for mean, label in zip(means, seen, strict=True):
+        for prop, place in zip(CATALOGUE.properties, label, strict=True):
+            ids = model.tokenizer.encode(f" {prop.levels[place]}", add_special_tokens=False)
+            mean += words[ids].mean(0).detach() / len(label)
+    expected = torch.tensor([random.Random(i).randrange(len(seen)) for i in range(100)])
+    with torch.no_grad():
+        projected = model.connector.projection(torch.stack([felt(seen[i], drawn) for i in expected]))
+    scale = means.square().mean(1).sqrt().mean() if normalize else 1.0
+    read = F.normalize(projected * scale - means.mean(0), dim=1) @ F.normalize(means - means.mean(0), dim=1).T
+    assert (read.argmax(1) == expected).sum() >= 90

@@ -1,7 +1,5 @@
 """Input ablations: no touch, another object's, noise; the same for every variant and batch."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -12,20 +10,15 @@ from pipeline.language.conversations import evaluation_features
 from pipeline.language.input_ablation import ablate_input
 from pipeline.training.embeddings import EmbeddingStore
 from tests.conftest import refused
-from tests.language.conftest import DIM, write_store
+from tests.language.conftest import DIM, stored
 
 
 def question(objects: str, video: int = 0) -> Question:
     said = Turn(user="{tactile}" * len(objects), assistant="x")
-    return Question(
-        question_id=objects,
-        task="PC",
-        part=Part.TEST,
-        videos=tuple(f"{o}_{video}" for o in objects),
-        objects=tuple(objects),
-        dialogues=(Dialogue(opd=Opd.ALL, turns=(said,)),),
-        gold=Gold(choice="yes", labels=((0,),) * len(objects), properties=("hardness",)),
-    )
+    gold = Gold(choice="yes", labels=((0,),) * len(objects), properties=("hardness",))
+    told = {"question_id": objects, "task": "PC", "part": Part.TEST, "objects": tuple(objects), "gold": gold}
+    dialogues = (Dialogue(opd=Opd.ALL, turns=(said,)),)
+    return Question(**told, videos=tuple(f"{o}_{video}" for o in objects), dialogues=dialogues)
 
 
 def store_of(folder: Path, videos: dict[str, int]) -> EmbeddingStore:
@@ -33,7 +26,7 @@ def store_of(folder: Path, videos: dict[str, int]) -> EmbeddingStore:
     frames = [(video, frame, "none") for video, count in videos.items() for frame in range(count)]
     tensor = torch.randn(len(frames), DIM, generator=torch.Generator().manual_seed(0))
     tensor[:, :2] = torch.tensor([(list(videos).index(video), frame) for video, frame, _ in frames])
-    return write_store(folder, frames, tensor)
+    return stored(folder, frames, tensor)
 
 
 @pytest.fixture

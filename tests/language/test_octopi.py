@@ -1,7 +1,5 @@
 """The model: embeddings in their places, the loss, and what is saved, loaded and refused."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -47,7 +45,6 @@ def test_normalized_touch_is_as_long_as_words(kind: str, tmp_path: Path) -> None
 
 
 def trained(model: OctopiForCausalLM) -> OctopiForCausalLM:
-    """With an adapter that changes something, and a connector that no seed draws."""
     for parameter in model.connector.parameters():
         torch.nn.init.normal_(parameter, std=0.1)
     return adapted(model)
@@ -104,16 +101,13 @@ def test_any_padding_token_leaves_the_end_to_be_learnt(
         assert (sample["input_ids"][0] == model.tokenizer.bos_token_id) == bos
 
 
-def test_without_unknown_token_the_end_pads(tmp_path: Path) -> None:
+def test_lacking_tokens(tmp_path: Path) -> None:
     folder = write_llama(tmp_path, pad=None)
     edit(folder / "tokenizer_config.json", unk_token=None)
     assert load_tokenizer(folder).pad_token == "</s>"
     edit(folder / "tokenizer_config.json", eos_token=None)
     with refused("language.weights: .*names no eos_token"):
         load_tokenizer(folder)
-
-
-def test_a_token_without_an_embedding_is_named(tmp_path: Path) -> None:
     folder = write_llama(tmp_path, vocab_size=255)
     with refused("the tokenizer .* has .*, of which the model has no embedding"):
         OctopiForCausalLM.from_base(folder, DIM)

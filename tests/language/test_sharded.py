@@ -5,8 +5,6 @@ added in another order. Adam divides each gradient by its own size, so an update
 to the rate: 1e-7 times the terms that cancel, far below the hundredth of a rate that is allowed here.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -26,8 +24,7 @@ from pipeline.core.io import write_jsonl
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import Material
 from pipeline.running.errors import UserError
-from tests.closure import ROOT
-from tests.conftest import HUNG
+from tests.conftest import HUNG, ROOT
 from tests.language.sharded import CONFIG, KINDS, run
 
 CHECKPOINT = {

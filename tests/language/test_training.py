@@ -1,7 +1,5 @@
 """Language trainings: what learns how fast, kills from which they resume to the bit, and rates that are too high."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import multiprocessing
@@ -28,8 +26,7 @@ from pipeline.scales import compose
 from pipeline.training.embeddings import STATISTICS_FILE, EmbeddingStore
 from pipeline.training.trainer import Trained, training_arguments
 from tests.checkpoints import contents, write_llama
-from tests.closure import ROOT
-from tests.conftest import Begun, refused
+from tests.conftest import ROOT, Begun, refused
 from tests.language.conftest import (
     DIM,
     SMALL,
@@ -37,9 +34,9 @@ from tests.language.conftest import (
     assert_comes_back,
     embedded,
     material,
+    stored,
     taking,
     train,
-    write_store,
 )
 
 CPU = RuntimeConfig(device="cpu")
@@ -102,10 +99,7 @@ def test_killed_and_resumed_ends_the_same(kind: str, when: str, left: int, held:
     assert ended.history == whole.history, "what is trained waits for the stage to write it"
 
 
-def test_a_checkpoint_s_key_changes_with_each_input(
-    held: Material, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A checkpoint holds only what is trained: gone on with on other inputs, it would be neither's."""
+def test_a_checkpoint_s_key_has_each_input(held: Material, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     weights, catalogue = tmp_path / "weights", tmp_path / "catalogue"
     embeddings, asked = embeddings_dir(Encoder.FINETUNED, 0), questions_file(0, "train")
@@ -165,7 +159,7 @@ def test_training_goes_on_from_a_trained_model(held: Material, checkpoints: Path
     after = {name for name, value in model.named_parameters() if not torch.equal(before[name], value)}
     assert {name for name in before if "lora_" in name} <= after
     assert not {name for name in after if name.startswith("llm") and "lora_" not in name}
-    other = replace(went_on, store=write_store(tmp_path / "other", [("a_0", 0, "none")], torch.zeros(1, DIM + 1)))
+    other = replace(went_on, store=stored(tmp_path / "other", [("a_0", 0, "none")], torch.zeros(1, DIM + 1)))
     with refused(f"begun reads embeddings of {DIM}, but the encoder gives {DIM + 1}; set encoder.backbone"):
         assemble(other, CONFIG, "align")
 
@@ -264,9 +258,7 @@ def test_threads_are_the_parameters_where_torch_was_imported_late(tmp_path: Path
 
 
 @pytest.mark.parametrize("tied", [False, True])
-def test_word_embeddings_are_trained_and_the_base_is_not(
-    tied: bool, held: Material, tmp_path: Path, checkpoints: Path
-) -> None:
+def test_words_are_trained_and_the_base_is_not(tied: bool, held: Material, tmp_path: Path, checkpoints: Path) -> None:
     """Also where the base pads with a word, and its matrix is its head too."""
     folder = write_llama(tmp_path / "base", tie_word_embeddings=tied, pad_token_id=1)
     model, data = assemble(replace(held, language=LanguageConfig(weights=str(folder))), taking(4), "test")

@@ -25,7 +25,7 @@ from pipeline.core.runtime import seed_everything
 from pipeline.language.chat import IGNORE_INDEX
 from pipeline.language.lora import add_lora
 from pipeline.language.octopi import OctopiForCausalLM
-from tests.models import model_folder
+from tests.checkpoints import model_folder
 from tests.numerics.bounds import longest_sum, magnification, rounded, summing
 from tests.numerics.harness import BFLOAT16, FLOAT16, FLOAT32, FLOAT64, NETWORKS, Check, Format, formats
 

@@ -1,7 +1,5 @@
 """A whole report from a made-up run: its files, its figures recomputed, runs that lack something, equal bytes."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -27,10 +25,9 @@ from pipeline.report.page import data_tables, write_page
 from pipeline.report.provenance import base_model, digest
 from pipeline.report.tables import TABLES
 from pipeline.videos.catalogue import Catalogue
-from tests.checkpoints import contents, edit
+from tests.checkpoints import contents, edit, model_folder
 from tests.closure import ROOT
 from tests.fake_run import fake_params, write_run
-from tests.models import model_folder
 
 FILES = {
     *("README.md", "params.yaml", "provenance.json", "metrics.json", "samples.json", "scores.csv", "effects.csv"),
@@ -171,7 +168,6 @@ def test_two_writes_are_equal_to_the_byte_whatever_another_run_left(written: Pat
 
 
 def test_a_run_that_measured_nothing_says_so_and_shows_no_picture_of_its_videos(tmp_path: Path) -> None:
-    """On real videos, with one variant, no test object, and nothing that a run may lack."""
     objects = "scenes.objects=[baseball,rug,pillow]"
     params = write_run(tmp_path, fake_params(objects, *ONE, "data.source=videos", "data.dir=elsewhere"))
     for file in ("audit/audit.csv", "encoder/0/classifications.parquet", "questions/0/evaluation.jsonl"):
@@ -204,7 +200,6 @@ def evaluated(root: Path, model: str, *right: int) -> None:
 
 
 def test_the_shipped_models_answers_come_first_and_the_plumbing_is_folded(tmp_path: Path) -> None:
-    """In the README and on the page, where it was asked; its figures are no other system's."""
     params = write_run(tmp_path, fake_params(*ONE, "questions.evaluation={opd:4,pc:4,pss:4,pom:0,psr:4}"))
     metrics = write_report(params, tmp_path)
     assert [name for name in metrics if name.isupper()] == ["OPD", "PC", "PSS", "PSR"]
@@ -226,7 +221,6 @@ def test_the_shipped_models_answers_come_first_and_the_plumbing_is_folded(tmp_pa
 
 
 def test_the_learning_curve_is_a_table_and_a_figure(tmp_path: Path) -> None:
-    """Numbers of objects in their order, each system a row; adapted models are no models as they came."""
     params = write_run(tmp_path, fake_params(*ONE, "ablation.train=false", "questions.evaluation={pc:4}"))
     for model, right in (("m", 10), ("m, adapted by 20", 30), ("m, adapted by 3", 20)):
         evaluated(tmp_path, model, right)
@@ -249,7 +243,6 @@ def test_the_learning_curve_is_a_table_and_a_figure(tmp_path: Path) -> None:
 
 
 def test_a_run_that_trains_nothing_reports_models_that_were_trained_before(tmp_path: Path) -> None:
-    """With sets of different questions, whose accuracies stand beside the interval over all of them."""
     only = ("ablation.train=false", "questions.evaluation={opd:0,pc:4,pss:0,pom:0,psr:0}")
     params = write_run(tmp_path, fake_params(*ONE, *only))
     evaluated(tmp_path, "octopi-7b", 20, 25, 30)

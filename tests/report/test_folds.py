@@ -1,7 +1,5 @@
 """Reports over folds: what is pooled, and what is said of missing folds, spoilt test objects and a taught base."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from pathlib import Path
 from statistics import fmean
@@ -83,7 +81,6 @@ def test_effects_are_paired_within_a_fold(twice: Path) -> None:
 
 
 def test_one_fold_of_three_is_reported_as_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With what was noted of this report, and not of one on other data."""
     (tmp_path / "notes.yaml").write_text("PhysiCLeAR:\n  smoke-scenes/kfold: of this one\n")
     monkeypatch.setattr("pipeline.report.provenance.NOTES", tmp_path / "notes.yaml")
     folder = run(tmp_path, "[1]")

@@ -1,7 +1,5 @@
 """The page over all reports: every figure on it is a cell of a file, it fetches nothing, and says what is missing."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json
@@ -11,17 +9,13 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from pipeline.cli import app
 from pipeline.report import page as module
 from pipeline.report.page import LARGEST, PAGE, left_to_users, write_page
 from pipeline.report.render import WORDS
-from pipeline.running.errors import UserError
 from tests.checkpoints import edit
-from tests.closure import ROOT
-from tests.report.conftest import report, score
-from tests.report.shared import Page, rows_of, words, write_reports, write_rows
+from tests.conftest import ROOT, octopi, refused
+from tests.report.conftest import Page, report, rows_of, score, words, write_reports, write_rows
 
 NUMBER = re.compile(r"[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]\d+)?")
 HOSTILE = "</style><script>alert(1)</script><img src=//evil.example onerror=alert(1)>\"'&"
@@ -51,7 +45,7 @@ def test_it_is_written_twice_alike_and_small(made: Path, monkeypatch: pytest.Mon
     assert write_page(made).read_bytes() == before
     assert len(before) < LARGEST <= 1.5e6
     monkeypatch.setattr(module, "LARGEST", len(before) - 1)
-    with pytest.raises(UserError, match=f"over {len(before) - 1}"):
+    with refused(f"over {len(before) - 1}"):
         write_page(made)
 
 
@@ -163,7 +157,7 @@ def test_what_is_missing_is_said_with_the_reason(changed: Path, monkeypatch: pyt
     write_rows(scores, [row for row in rows_of(scores) if row["task"] not in ("PSR", "heads_recall")])
     monkeypatch.chdir(changed)
     Path("dvc.yaml").touch()  # As in a project.
-    assert CliRunner().invoke(app, ["page"]).output.startswith(f"{PAGE}: ")
+    assert octopi("page").startswith(f"{PAGE}: ")
     page = Page(changed / PAGE)
     said = {words(e[0]): words(e[1]) for e in page.named("missing").iter("div")}
     for what in ("effects.csv", "Scenario", "Recall of the property heads"):
@@ -173,7 +167,8 @@ def test_what_is_missing_is_said_with_the_reason(changed: Path, monkeypatch: pyt
     assert "make bench" in words(page.named("speed"))
     assert "lacks format, finite" in said["stability"]
     scores.unlink()
-    assert "make repro" in str(CliRunner().invoke(app, ["page"]).exception)
+    with refused("make repro"):
+        octopi("page")
 
 
 @pytest.mark.parametrize(
@@ -186,7 +181,6 @@ def test_what_is_missing_is_said_with_the_reason(changed: Path, monkeypatch: pyt
     ],
 )
 def test_what_only_users_can_measure_is_missing_until_they_have(said: dict[str, str], covered: set[str]) -> None:
-    """Not by synthetic fruit, nor by photos of other objects."""
     cells = {key: said[key] for key in ("task", "touch") if key in said}
     about = {"source": "videos", "dataset": "avocados", **{k: v for k, v in said.items() if k not in cells}}
     left = {what for _, what, _ in left_to_users([report([score(**cells)], **about)])}

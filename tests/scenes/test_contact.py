@@ -1,7 +1,5 @@
 """Choosing how to compute a contact, and what each way gives: against the finest grid, physics' order, hard cases."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the tests of the tasks share: PhysiCLeAR's objects, and what grades an answer."""
 
-from __future__ import annotations
-
 import random
 from itertools import islice
 
@@ -9,10 +7,10 @@ from pipeline.core.records import Part, Prediction, Question
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool
 from pipeline.tasks.records import Score
-from pipeline.videos.catalogue import Catalogue, load_catalogue
-from tests.closure import ROOT
+from pipeline.videos.catalogue import Catalogue
+from tests.conftest import CATALOGUE as PHYSICLEAR
 
-CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear").asking("published")
+CATALOGUE = PHYSICLEAR.asking("published")
 POOL = Pool(Part.TEST, CATALOGUE, {o: [f"{o}_0"] for o in CATALOGUE.objects})
 
 

@@ -1,7 +1,5 @@
 """The table of choices says what the code does, and what the paper's source does."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 from typing import Any
@@ -10,7 +8,7 @@ import pytest
 
 from pipeline.scales import compose
 from tests.closure import ROOT
-from tests.report.shared import rows_of
+from tests.report.conftest import rows_of
 
 HEADER = ["Element", "Paper", "Published code", "Here", "Why"]
 LINES = [line for line in (ROOT / "docs" / "choices.md").read_text(encoding="utf-8").splitlines() if line[:1] == "|"]

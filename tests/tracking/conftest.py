@@ -62,7 +62,6 @@ class FakeChain:
     folder: Path
 
     def copy(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeChain]:
-        """Copy it, and make that the working directory of a process that tracks."""
         shutil.copytree(self.folder, folder)
         monkeypatch.chdir(folder)
         out_of_reach.clear()
@@ -70,7 +69,6 @@ class FakeChain:
         out_of_reach.clear()
 
     def write(self) -> None:
-        """Write it whole to the working directory."""
         write_params(self.params)
         Path("dvc.yaml").write_text(CHAIN)
         for title in TITLES:
@@ -155,7 +153,6 @@ def again(published: FakeChain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 def client(uri: str = "") -> MlflowClient:
-    """MLflow's own client."""
     from mlflow import MlflowClient
 
     return MlflowClient(uri or f"sqlite:///{Path('mlruns/mlflow.db').resolve()}")

@@ -1,7 +1,5 @@
 """Trainings that log while they run: their curves, their ends, and that nothing which tracking does reaches them."""
 
-from __future__ import annotations
-
 import inspect
 import multiprocessing
 import os
@@ -12,7 +10,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -39,8 +36,7 @@ from pipeline.tracking.live import live
 from pipeline.tracking.publish import publish
 from pipeline.tracking.store import TrackingError, out_of_reach
 from pipeline.training.trainer import TrainableTrainer, Trained, train, training_arguments
-from tests.closure import ROOT
-from tests.conftest import HUNG
+from tests.conftest import HUNG, ROOT, wait_for
 from tests.tracking.conftest import FIRST, FULL, FakeChain, by_name, client, losses, runs
 
 ALIGN = "align@finetuned-all-0"
@@ -52,8 +48,6 @@ def watched(params: Params, **values: object) -> Params:
 
 
 class Line(nn.Module):
-    """The smallest thing that a Trainer trains."""
-
     def __init__(self) -> None:
         super().__init__()
         self.layer = nn.Linear(2, 1)
@@ -63,7 +57,6 @@ class Line(nn.Module):
 
 
 def fit(params: Params, callbacks: Sequence[Any]) -> Trained:
-    """Some steps on made-up points; the same whenever it is called."""
     torch.manual_seed(0)
     data = [{"inputs": torch.tensor([i, 1.0]), "labels": torch.tensor(2.0 * i)} for i in range(8)]
     arguments = training_arguments(Path("fit"), params.runtime, 0, params.pretrain, max_steps=STEPS, logging_steps=1)
@@ -71,9 +64,7 @@ def fit(params: Params, callbacks: Sequence[Any]) -> Trained:
 
 
 @pytest.mark.parametrize("broken", [False, True], ids=["whole", "the server was away at the end"])
-def test_a_training_and_publishing_share_one_run(
-    chain: FakeChain, monkeypatch: pytest.MonkeyPatch, broken: bool
-) -> None:
+def test_a_training_and_publishing_share_a_run(chain: FakeChain, monkeypatch: pytest.MonkeyPatch, broken: bool) -> None:
     """What a live run lacks of its curve, publishing adds."""
     log_batch = mlflow.MlflowClient.log_batch
 
@@ -89,10 +80,7 @@ def test_a_training_and_publishing_share_one_run(
         with live(stage) as callbacks:
             assert by_name("stage")[ALIGN].info.status == "RUNNING"
             trained = fit(chain.params, callbacks)
-            deadline = time.monotonic() + HUNG
-            while not any(m.startswith("system/") for m in by_name("stage")[ALIGN].data.metrics):
-                assert time.monotonic() < deadline, "no system metrics"
-                time.sleep(0.1)
+            wait_for(lambda: any(m.startswith("system/") for m in by_name("stage")[ALIGN].data.metrics))
     run, (parent,) = by_name("stage")[ALIGN], runs("reproduction")
     assert (run.info.status, parent.info.status) == ("RUNNING" if broken else "FINISHED", "RUNNING")
     assert run.info.start_time == int(stage.started * 1000)
@@ -182,9 +170,7 @@ def test_an_unfinished_reproduction_of_another_scale_ends(chain: FakeChain) -> N
 
 
 @pytest.mark.parametrize(("on", "rank"), [(False, "0"), (True, "1")])
-def test_without_live_logging_and_beside_the_first_process_mlflow_is_not_imported(
-    chain: FakeChain, on: bool, rank: str
-) -> None:
+def test_mlflow_is_not_imported_without_logging_or_in_a_second_process(chain: FakeChain, on: bool, rank: str) -> None:
     shutil.rmtree("mlruns")
     write_params(watched(chain.params, live=on))
     code = (
@@ -261,9 +247,7 @@ def test_out_of_reach_costs_one_warning_and_one_call(
         assert "S3cret" not in line
 
 
-def test_a_server_that_dies_while_a_training_goes_on(
-    chain: FakeChain, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_server_that_dies_meanwhile(chain: FakeChain, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     Path("mlruns").rename(tmp_path / "server")
     store = ["--backend-store-uri", f"sqlite:///{tmp_path / 'server' / 'mlflow.db'}"]
     place = ["--host", "127.0.0.1", "--port", "0", "--workers", "1"]
@@ -296,8 +280,5 @@ def test_a_server_that_dies_while_a_training_goes_on(
 
 def address(log: Path) -> str:
     """Where a server listens, at a port that it chose itself, as soon as it says so."""
-    deadline = time.monotonic() + HUNG
-    while not (found := re.search(r"running on (http://\S+)", log.read_text())):
-        assert time.monotonic() < deadline, "the server did not start"
-        time.sleep(0.3)
-    return found[1]
+    wait_for(lambda: " running on http" in log.read_text())
+    return re.findall(r"running on (http://\S+)", log.read_text())[0]

@@ -1,7 +1,5 @@
 """A trained model of random weights, made once."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

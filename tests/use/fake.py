@@ -1,7 +1,5 @@
 """A model of the contract's shape that needs no weights, a server in a thread, and requests in OpenAI's form."""
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import json

@@ -1,7 +1,5 @@
 """The chain in small, by its libraries: videos, an encoder, a language model and their stored answers."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -10,21 +8,9 @@ import numpy as np
 import torch
 
 from pipeline.config import Params
+from pipeline.core import records
 from pipeline.core.io import fingerprint, save_tensors, write_json, write_jsonl, write_table
-from pipeline.core.records import (
-    INDEX_FILE,
-    TENSOR,
-    TENSOR_FILE,
-    Embedding,
-    Encoder,
-    Lora,
-    Opd,
-    Part,
-    Prediction,
-    Question,
-    TouchInput,
-    Variant,
-)
+from pipeline.core.records import Embedding, Encoder, Lora, Opd, Part, Prediction, Question, TouchInput, Variant
 from pipeline.core.runtime import seed_everything
 from pipeline.encoder.data import EncoderData, classify
 from pipeline.encoder.embed import Loaded, embed_videos, standardize, statistics
@@ -109,8 +95,10 @@ def make(where: Path, variant: Variant, *overrides: str) -> Made:
     raw, index = embed_videos(Loaded(encoder.eval(), store, CPU, 16), parts)
     known = statistics(raw, index, {a.video_id for a in parts if a.part is Part.TRAIN})
     folder = data / "embeddings" / f"{variant.encoder}-0"
-    save_tensors(folder / TENSOR_FILE, {TENSOR: standardize(raw, known) if params.encoder.standardize else raw})
-    write_table(folder / INDEX_FILE, Embedding, index)
+    save_tensors(
+        folder / records.TENSOR_FILE, {records.TENSOR: standardize(raw, known) if params.encoder.standardize else raw}
+    )
+    write_table(folder / records.INDEX_FILE, Embedding, index)
     known._replace(frames=fingerprint(params.frames)).save(folder / STATISTICS_FILE)
     embeddings = EmbeddingStore(folder)
 
@@ -149,11 +137,7 @@ def make(where: Path, variant: Variant, *overrides: str) -> Made:
 
 
 def replay(
-    model: Octopi,
-    questions: Sequence[Question],
-    predictions: Sequence[Prediction],
-    opd: Opd,
-    files: Mapping[str, Path],
+    model: Octopi, questions: Sequence[Question], predictions: Sequence[Prediction], opd: Opd, files: Mapping[str, Path]
 ) -> int:
     """Ask the evaluation's questions turn by turn, from the files, and count them: answers must be the stored ones."""
     asked = {q.question_id: q for q in questions}

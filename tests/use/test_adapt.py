@@ -1,7 +1,5 @@
 """A model's copy for another sensor, by videos alone and by rated ones: against float64 of what its heads see."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 
@@ -16,10 +14,8 @@ from pipeline.use.few_ratings import Known, Rated, Way, fit, read_anew, standard
 from pipeline.use.folder import CONFIG, find_base, read_folder
 from pipeline.use.model import UNRATED, Octopi
 from pipeline.videos.catalogue import Catalogue, load_catalogue
-from tests.checkpoints import edit
-from tests.closure import ROOT
-from tests.conftest import refused, write_video
-from tests.models import model_folder
+from tests.checkpoints import edit, model_folder
+from tests.conftest import ROOT, refused, write_video
 from tests.use.shared import Made
 
 EXAMPLES = ROOT / "examples"
@@ -146,7 +142,6 @@ def test_what_cannot_be_adapted(octopi: Octopi, catalogue: Catalogue, tmp_path: 
 def test_heads_of_another_recipe_stay(
     made: Made, files: list[Path], catalogue: Catalogue, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """And a video in which nothing is touched is left out, with a line."""
     model = Octopi.from_pretrained(made.folder, device="cpu")
     with refused("heads are read anew where it has been fine-tuned with encoder.recipe=tuned"):
         adapt(model, files, tmp_path / "mine", catalogue=catalogue, objects=["rug", "pillow"])

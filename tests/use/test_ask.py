@@ -1,7 +1,5 @@
 """`octopi ask` and `octopi describe`: what a person types, what machines read, and going on after a kill."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys
@@ -18,7 +16,8 @@ from pipeline.use import ask as asking
 from pipeline.use.ask import Chat, describe_folder, described
 from pipeline.use.model import Octopi
 from tests.conftest import not_utf8, refused
-from tests.report.shared import rows_of
+from tests.conftest import octopi as command
+from tests.report.conftest import rows_of
 from tests.use.shared import Made
 
 QUESTION = "Describe {tactile}."
@@ -167,20 +166,16 @@ def test_a_row_of_the_table_has_its_files_name(octopi: Octopi, files: list[Path]
     assert [*table.columns[0].cells] == [files[0].name, str(files[1]), str(twin)]
 
 
-def test_an_unknown_property_is_refused_before_a_model_is_loaded(
-    made: Made, files: list[Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unknown_property_loads_no_model(made: Made, files: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Octopi, "from_pretrained", lambda *_, **__: pytest.fail("loaded"))
     for words in (("compare", *files[:2], "softness"), ("rank", "softness", *files[:2])):
-        found = CliRunner().invoke(app, [*map(str, words), "--model", str(made.folder)])
-        assert "softness: no property of this model; " in str(found.exception)
-        assert "hardness (harder, softer)" in str(found.exception)
+        with refused(r"softness: no property of this model; .*hardness \(harder, softer\)"):
+            command(*words, "--model", made.folder)
 
 
 def test_described_compared_ranked_and_matched_by_command(
     by_command: Command, octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each as the call of the same name, and what makes one doubt it on stderr, once."""
     monkeypatch.setattr(octopi, "doubts", ("no answer means anything",))
 
     def said(*words: object) -> str:
@@ -207,9 +202,7 @@ def test_described_compared_ranked_and_matched_by_command(
         assert [line.partition(": ")[2].partition(" (")[0] for line in lines] == list(matched.heads)
 
 
-def test_a_killed_description_goes_on(
-    octopi: Octopi, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_kill_loses_no_row(octopi: Octopi, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(asking, "BATCH", 1)
     whole, out = tmp_path / "whole.csv", tmp_path / "out.csv"
     describe_folder(octopi, [folder], whole)

@@ -1,7 +1,5 @@
 """The demo: what the page is given, what it refuses, and all of it in a real browser."""
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import threading
@@ -22,17 +20,15 @@ from pipeline.use.model import Octopi
 from pipeline.use.results import Exchange
 from pipeline.use.server import Failed
 from pipeline.videos.catalogue import Catalogue
-from tests.conftest import HUNG, ROOT, refused
+from tests.conftest import HUNG, PHYSICLEAR, refused
 from tests.use.browser import tab
 from tests.use.fake import KEPT, FakeOctopi, digest, running
 from tests.use.videos import press
 
-CATALOGUE = ROOT / "pipeline" / "physiclear"
-
 
 @pytest.fixture(scope="module")
 def session(catalogue: Catalogue) -> Session:
-    recipes = load_recipes(CATALOGUE, catalogue, 0)
+    recipes = load_recipes(PHYSICLEAR, catalogue, 0)
     model: Any = FakeOctopi()
     return Session(model, catalogue, {o: recipes[o] for o in ("baseball", "pillow")})
 
@@ -94,7 +90,7 @@ def test_an_answer_streams_with_its_history(site: str, session: Session, tmp_pat
     model.gate = None
 
 
-def test_an_answer_that_nobody_hears_ends(site: str, session: Session) -> None:
+def test_an_answer_that_nobody_hears_ends_and_one_that_breaks_off_says_so(site: str, session: Session) -> None:
     model: Any = session.model
     model.seconds = 0.01
     with httpx2.stream("POST", f"{site}/api/ask", json={"question": "endless"}, timeout=HUNG) as response:
@@ -103,6 +99,7 @@ def test_an_answer_that_nobody_hears_ends(site: str, session: Session) -> None:
     time.sleep(0.05)
     assert model.made == made
     model.seconds = 0.0
+    assert said(session, question="crash") == f"crash \n[{Failed()}]"
 
 
 def said(session: Session, **asked: Any) -> str:
@@ -110,10 +107,6 @@ def said(session: Session, **asked: Any) -> str:
         return "".join([piece async for piece in await session.stream(Asked(**asked))]).split(ASIDE)[0]
 
     return asyncio.run(whole())
-
-
-def test_an_answer_that_breaks_off_says_so(session: Session) -> None:
-    assert said(session, question="crash") == f"crash \n[{Failed()}]"
 
 
 def test_what_is_wrong_comes_back_as_one_line(site: str, tmp_path: Path) -> None:
@@ -134,15 +127,14 @@ def test_what_is_wrong_comes_back_as_one_line(site: str, tmp_path: Path) -> None
     assert httpx2.get(f"{site}/api/about").status_code == 200, "the server goes on"
 
 
-def test_a_video_beyond_the_limit_is_refused(site: str, session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_large_video_and_other_sites_are_refused(
+    site: str, session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("pipeline.use.demo.MOST_BYTES", 2_000_000)
     before = set(session.folder.iterdir())
     answer = put(site, "a.mp4", bytes(2_000_001))
     assert (answer.status_code, answer.json()["error"]) == (422, "a.mp4: more than 2 MB; drop a shorter video")
     assert set(session.folder.iterdir()) == before, "nothing of it is kept"
-
-
-def test_other_sites_are_not_let_in(site: str) -> None:
     assert httpx2.get(f"{site}/api/about", headers={"Host": "evil.example"}).status_code == 400
     plain = {"Content-Type": "text/plain"}  # What a page of another site may send without asking first.
     assert httpx2.post(f"{site}/api/ask", content=b'{"question": "hi"}', headers=plain).status_code == 422
@@ -168,7 +160,6 @@ def test_old_touches_are_forgotten(tmp_path: Path, catalogue: Catalogue) -> None
 
 
 def test_a_trained_model_is_shown_and_asked(octopi: Octopi, files: list[Path], catalogue: Catalogue) -> None:
-    """The class itself, of random weights: what the page is given is what it says by itself."""
     session = Session(octopi, catalogue, {})
     shown = asyncio.run(session.work(lambda: session.show("ice block", files[0])))
     described = octopi.describe(files[0])

@@ -1,7 +1,5 @@
 """The model that is shipped: whole, small, found from anywhere, and not random."""
 
-from __future__ import annotations
-
 import re
 import runpy
 from collections import Counter
@@ -35,11 +33,10 @@ from pipeline.use.adapt import adapt
 from pipeline.use.evaluate import after_ratings, answers_about, answers_after_ratings, check_rated
 from pipeline.use.folder import Base, find_base, read_folder
 from pipeline.use.model import REAL, Octopi, on_real_videos
-from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.records import Assignment, Video
-from tests.closure import ROOT
-from tests.conftest import fake_videos
-from tests.models import model_folder
+from tests.checkpoints import model_folder
+from tests.conftest import CATALOGUE, ROOT, fake_videos
 
 EXAMPLES = ROOT / "examples"
 LARGEST, RANK, VIDEO = 40e6, 32, 200_000
@@ -121,7 +118,7 @@ def test_the_learning_curve_of_the_documents_is_that_of_the_report() -> None:
     assert "\n".join(curve()) in document
 
 
-def test_its_language_model_is_made_once(
+def test_its_llm_is_made_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
@@ -155,7 +152,6 @@ def octopi(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Octopi]:
 def test_it_tells_touches_apart_from_any_folder(
     octopi: Octopi, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """As a newcomer types it, and the other way round; and which of three is what."""
     soft, hard, rough = (EXAMPLES / f"{name}.mp4" for name in ("soft", "hard", "rough"))
     assert max(f.stat().st_size for f in EXAMPLES.glob("*.mp4")) <= VIDEO
     question = "Which is softer? {tactile} {tactile}"
@@ -171,18 +167,12 @@ def test_it_tells_touches_apart_from_any_folder(
 
 
 @pytest.mark.slow
-def test_a_runs_videos_are_asked_about_as_they_are_and_standardised(
-    octopi: Octopi, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_runs_videos_are_asked_about_twice(octopi: Octopi, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What it says of them is what it says to a person who asks; an object that it was trained on stops the stage."""
     changed = ["data.source=videos", f"data.dir={EXAMPLES}", f"data.catalogue={ROOT}/pipeline/physiclear"]
-    few = [
-        "kernels=machine",
-        "evaluate.questions=4",
-        "evaluate.repeats=2",
-        "questions.evaluation={opd:9,pc:9,pss:0,pom:9,psr:0}",
-    ]
-    write_params(compose("smoke", [*changed, *few], ROOT / "conf"), tmp_path / "params.yaml")
+    changed += ["kernels=machine", "evaluate.questions=4", "evaluate.repeats=2"]
+    changed += ["questions.evaluation={opd:9,pc:9,pss:0,pom:9,psr:0}"]
+    write_params(compose("smoke", changed, ROOT / "conf"), tmp_path / "params.yaml")
     monkeypatch.chdir(tmp_path)
     # Two threads of each of two test processes would wait for each other on two cores.
     monkeypatch.setattr("pipeline.core.runtime.limit_threads", lambda _: None)
@@ -217,9 +207,7 @@ def test_a_runs_videos_are_asked_about_as_they_are_and_standardised(
 
 
 @pytest.mark.slow
-def test_after_ratings_it_answers_as_the_copy_that_adapt_makes(
-    octopi: Octopi, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_after_ratings_it_answers_as_its_copy(octopi: Octopi, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """About test objects alone, whose ratings it never had; without ratings by the training videos alone."""
     monkeypatch.setattr("pipeline.core.runtime.limit_threads", lambda _: None)
     changed = [f"data.dir={EXAMPLES}", f"data.catalogue={ROOT}/pipeline/physiclear", "data.source=videos"]
@@ -231,9 +219,8 @@ def test_after_ratings_it_answers_as_the_copy_that_adapt_makes(
     split = [
         Assignment(video_id=v.video_id, object_id=v.object_id, part=parts.get(v.object_id, Part.TEST)) for v in videos
     ]
-    catalogue = load_catalogue(ROOT / "pipeline" / "physiclear")
     own = [EXAMPLES / f"{files[name]}.mp4" for name in parts]
-    for count, ratings in ((0, None), (2, catalogue)):
+    for count, ratings in ((0, None), (2, CATALOGUE)):
         graded = answers_after_ratings(octopi, params, videos, split, 0, count)
         assert {r.model for r in graded} == {f"octopi-small, adapted by {count}"}
         assert {r.objects for r in graded} == {("pillow",), ("steel_wool",)}

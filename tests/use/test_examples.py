@@ -1,7 +1,5 @@
 """What stands in examples/ does what it says."""
 
-from __future__ import annotations
-
 import re
 import runpy
 import shlex

@@ -1,7 +1,5 @@
 """The folder of a trained model: whole, without pickles, and noticed where anything in it or below it is another."""
 
-from __future__ import annotations
-
 import json
 import runpy
 import shutil
@@ -10,9 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from typer.testing import CliRunner
 
-from pipeline.cli import app
 from pipeline.core.records import Part
 from pipeline.evaluation.grading import grade
 from pipeline.tasks import TASKS
@@ -21,15 +17,13 @@ from pipeline.use.model import Octopi
 from pipeline.use.package import export, package
 from pipeline.videos.catalogue import load_catalogue
 from tests.checkpoints import contents, edit, write_llama
-from tests.closure import ROOT
-from tests.conftest import refused
+from tests.conftest import ROOT, octopi, refused
 from tests.fake_run import fake_params
 from tests.use.shared import PARTS, Made
 
 
 @pytest.fixture
 def copy(made: Made, tmp_path: Path) -> Path:
-    """A copy of the folder, far from its language model."""
     return Path(shutil.copytree(made.folder, tmp_path / "copy"))
 
 
@@ -67,10 +61,7 @@ def test_equal_inputs_give_equal_folders(made: Made, tmp_path: Path, monkeypatch
     assert contents(tmp_path / "new") == contents(made.folder)
 
 
-def test_the_stage_packages_the_full_system_and_the_others_on_demand(
-    made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Each folder holds the whole encoder, and the chain trains eight variants."""
+def test_the_stage_packages_what_is_asked_for(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(made.folder.parents[1], tmp_path, dirs_exist_ok=True)
     shutil.rmtree(tmp_path / "models")
     for trained in (tmp_path / "data" / "models").iterdir():
@@ -90,8 +81,7 @@ def test_export_with_its_base_needs_nothing_else(made: Made, copy: Path, files: 
     expected = Octopi.from_pretrained(made.folder).ask(*question)
     with refused(r"language model llama is not there .*--base"):
         Octopi.from_pretrained(copy)
-    command = ["export", str(made.folder), str(tmp_path / "whole"), "--with-base"]
-    assert CliRunner().invoke(app, command).exit_code == 0
+    octopi("export", made.folder, tmp_path / "whole", "--with-base")
     assert Octopi.from_pretrained(tmp_path / "whole").ask(*question) == expected
     with refused("is there already"):
         export(made.folder, tmp_path / "whole")

@@ -1,7 +1,5 @@
 """Models on the Hugging Face Hub: huggingface_hub itself, in processes of their own, against a small server."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json
@@ -74,9 +72,7 @@ def hub(made: Made, tmp_path: Path) -> Iterator[Hub]:
         yield run, files, asked
 
 
-def test_what_is_pushed_comes_back_and_answers_the_same(
-    made: Made, hub: Hub, files: list[Path], tmp_path: Path
-) -> None:
+def test_what_is_pushed_comes_back_and_answers_alike(made: Made, hub: Hub, files: list[Path], tmp_path: Path) -> None:
     run, there, asked = hub
     assert "language/connector.safetensors\n" in run("push", str(made.folder), NAME, "--dry-run")
     assert not asked
@@ -104,9 +100,7 @@ def test_what_is_pushed_comes_back_and_answers_the_same(
         (["--private"], {"HF_TOKEN": "ann"}, "is there already, and public"),
     ],
 )
-def test_what_cannot_be_pushed_ends_with_a_line(
-    options: list[str], environment: dict[str, str], line: str, made: Made, hub: Hub
-) -> None:
+def test_what_is_not_pushed(options: list[str], environment: dict[str, str], line: str, made: Made, hub: Hub) -> None:
     said = hub[0]("push", str(made.folder), NAME, *options, status=1, **environment)
     assert said.startswith(f"octopi: {NAME}: {line}")
     assert "\n" not in said

@@ -1,7 +1,5 @@
 """`octopi live`: presses found while they happen, on files and on a camera that drops frames."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -85,9 +83,7 @@ class Camera:
         self.opens = False
 
 
-def test_by_command_on_a_file_and_on_a_camera_that_drops_frames(
-    made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_by_command_on_a_file_and_a_lossy_camera(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pictures = recording(TOUCHED, LENGTH)
     write_film(tmp_path / "long.mp4", pictures, 25.0)
     command, model = ["live", "--times", "4"], ["--model", str(made.folder), "--device", "cpu"]

@@ -1,7 +1,5 @@
 """Videos that clients send: what is taken, what is refused, and at what cost."""
 
-from __future__ import annotations
-
 import base64
 import os
 import sys

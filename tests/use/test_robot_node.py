@@ -1,7 +1,5 @@
 """The example node: its ROS side against a double of rclpy, its HTTP side against a served model."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 from collections.abc import Iterator
@@ -73,7 +71,6 @@ def example() -> Iterator[ModuleType]:
 
 @pytest.fixture(scope="module")
 def served() -> Iterator[str]:
-    """`octopi serve`, with a token."""
     with running(make_app(FakeOctopi(), "finetuned-with-all-0", token="secret of the robot")) as port:
         yield f"http://127.0.0.1:{port}"
 
@@ -123,7 +120,6 @@ def test_what_goes_wrong_is_one_line_of_the_server(node: Any, tmp_path: Path, mo
     (notes := tmp_path / "notes.mp4").write_text("no video")
     video = press(tmp_path / "a.mp4")
     for asked, told, answer in (
-        (goal("Soft?", notes), "video", ""),
         (goal("{tactile} {tactile}?", video), "2 {tactile} for 1 video;", ""),
         (goal("Soft?", tmp_path / "none.mp4"), "none.mp4", ""),
         (goal("crash", video), str(Failed()), "{tactile} crash "),  # What came is kept, but it is no answer.

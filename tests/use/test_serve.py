@@ -1,13 +1,13 @@
-"""`octopi serve` in process: OpenAI's forms field by field, and every way to be refused."""
+"""`octopi serve` in process: OpenAI's forms field by field, every way to be refused, and questions in one batch."""
 
-from __future__ import annotations
-
+import asyncio
 import json
 import re
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import AsyncGenerator, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,11 @@ from openai.types import Model
 from openai.types.chat import ChatCompletion, ChatCompletionChunk
 from starlette.testclient import TestClient
 
+from pipeline.language.generate import Stream
+from pipeline.running.errors import UserError
 from pipeline.use.model import Octopi
 from pipeline.use.serve import make_app, read_token
-from pipeline.use.server import listen
+from pipeline.use.server import Failed, Worker, listen
 from tests.conftest import HUNG, refused
 from tests.use.fake import CHAT, FakeOctopi, body, digest, events, part, said, text, user
 from tests.use.videos import video
@@ -58,7 +60,6 @@ def error(response: Any, status: int) -> str:
 
 
 def test_an_answer_has_openai_s_form(client: TestClient) -> None:
-    """By the types of OpenAI's own client, which know every field and what it may be."""
     began = time.time()
     response = client.post(CHAT, json=body(user(text("How soft is it?"), part(video(1)))))
     answer = ChatCompletion.model_validate(response.json())
@@ -177,9 +178,7 @@ BAD: list[tuple[bytes | dict[str, Any], int, str]] = [
 
 
 @pytest.mark.parametrize(("bad", "status", "words"), BAD)
-def test_bad_requests_are_refused_in_one_line_and_leave_their_place(
-    client: TestClient, bad: bytes | dict[str, Any], status: int, words: str
-) -> None:
+def test_bad_requests_keep_no_place(client: TestClient, bad: bytes | dict[str, Any], status: int, words: str) -> None:
     content = bad if isinstance(bad, bytes) else json.dumps(bad).encode()
     for _ in range(3):  # There are two places.
         response = client.post(CHAT, content=content, headers={"Content-Type": "application/json"})
@@ -187,15 +186,12 @@ def test_bad_requests_are_refused_in_one_line_and_leave_their_place(
     assert client.get("/health").json()["waiting"] == 0
 
 
-def test_other_refusals(client: TestClient) -> None:
+def test_other_refusals_and_a_model_that_breaks(client: TestClient) -> None:
     error(client.get("/nowhere"), 404)
     error(client.get("/v1/models/gpt-4"), 404)
     error(client.get(CHAT), 405)
     error(client.post(CHAT, content=b"{}", headers={"Content-Type": "text/plain"}), 415)
     assert "octopi" in error(client.post(CHAT, json={**body(ASK), "model": "gpt-4"}), 404)
-
-
-def test_a_model_that_breaks_and_one_that_refuses_late(client: TestClient) -> None:
     for stream in (False, True):
         assert "the server's log says why" in error(client.post(CHAT, json=body(user("break"), stream=stream)), 500)
     assert client.post(CHAT, json=body(ASK)).status_code == 200
@@ -222,7 +218,7 @@ def test_429_when_all_places_are_taken(client: TestClient, fake: FakeOctopi) -> 
     assert client.post(CHAT, json=body(ASK)).status_code == 200
 
 
-def test_addresses() -> None:
+def test_addresses_and_tokens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for host, token in (("localhost", ""), ("0.0.0.0", "x" * 16)):
         listen(host, 0, token).close()
     with listen("127.0.0.1", 0) as taken:
@@ -233,9 +229,6 @@ def test_addresses() -> None:
         ):
             with refused(words):
                 listen(host, port)
-
-
-def test_tokens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OCTOPI_TOKEN", " \n")
     assert read_token(None) == ""
     (file := tmp_path / "token").write_text(f" {'x' * 16}\n")
@@ -247,3 +240,89 @@ def test_tokens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OCTOPI_TOKEN", "short")
     with refused("OCTOPI_TOKEN.*openssl"):
         read_token(None)
+
+
+QUESTIONS = (("Describe this. {tactile}", 1, None), ("Is it soft?", 1, 3), ("Which is softer?", 2, 20), ("Why?", 3, 1))
+
+
+async def everything(pieces: AsyncGenerator[Any]) -> str:
+    return "".join([piece async for piece in pieces]).strip()
+
+
+@pytest.fixture
+def batches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many were answered at once, batch by batch."""
+    sizes: list[int] = []
+    together = Stream.together
+
+    def counted(streams: Sequence[Stream], left: Collection[int]) -> Iterator[tuple[int, str | None]]:
+        sizes.append(len(streams))
+        return together(streams, left)
+
+    monkeypatch.setattr(Stream, "together", staticmethod(counted))
+    return sizes
+
+
+def test_what_waits_is_one_batch_answered_as_alone(octopi: Octopi, files: list[Path], batches: list[int]) -> None:
+    """Beside one that is refused, one that breaks, one that is given up before its turn, and one in the middle."""
+    alone = [octopi.ask(q, files[:n], max_new_tokens=most) for q, n, most in QUESTIONS]
+
+    async def ask() -> list[Any]:
+        worker, gate = Worker(), threading.Event()
+        first = asyncio.ensure_future(everything(worker.answer(lambda: [str(gate.wait(HUNG))])))
+
+        def queue(question: str, count: int, most: int | None = None) -> AsyncGenerator[Any]:
+            asked = partial(octopi.stream, question, files[:count], max_new_tokens=most)
+            return worker.answer(asked)
+
+        asked = [queue(*each) for each in QUESTIONS]
+        refused, never, halfway = queue("{tactile}", 0), queue("Never?", 1), queue("Halfway?", 1)
+        broken = worker.answer(lambda: iter([1 / 0]))
+        begun = asyncio.ensure_future(anext(never))
+        await asyncio.sleep(0)
+        begun.cancel()
+        await asyncio.gather(begun, return_exceptions=True)
+        gate.set()
+        whole = [asyncio.ensure_future(everything(pieces)) for pieces in asked]
+        await anext(halfway)
+        await halfway.aclose()
+        failed = await asyncio.gather(everything(refused), everything(broken), return_exceptions=True)
+        found = [await first, *map(type, failed), await asyncio.gather(*whole)]
+        await asyncio.to_thread(worker.stop)
+        return found
+
+    *failed, answered = asyncio.run(ask())
+    assert failed == ["True", UserError, Failed]
+    assert answered == [text.strip() for text in alone]
+    assert batches[-1] == len(QUESTIONS) + 1
+
+
+def test_who_asks_moments_later_is_in_the_same_batch(
+    octopi: Octopi, files: list[Path], batches: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.use.server.PAUSE", 5.0)
+
+    async def ask() -> None:
+        worker, found = Worker(), []
+        for _ in range(2):
+            found.append(worker.answer(lambda: octopi.stream("Why?", files[:1])))
+            await asyncio.sleep(0.2)  # The thread has taken the first one by now.
+        await asyncio.gather(*map(everything, found))
+        await asyncio.to_thread(worker.stop)
+
+    asyncio.run(ask())
+    assert batches == [2]
+
+
+def test_a_batch_that_breaks_fails_all(octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    async def ask() -> list[Any]:
+        worker = Worker()
+        asked = [worker.answer(lambda: octopi.stream("Why?", files[:1])) for _ in range(3)]
+        found = await asyncio.gather(*map(everything, asked), return_exceptions=True)
+        monkeypatch.undo()
+        after = await everything(worker.answer(lambda: octopi.stream("Why?", files[:1])))
+        await asyncio.to_thread(worker.stop)
+        return [*map(type, found), after]
+
+    monkeypatch.setattr("pipeline.language.generate.greedy_tokens", lambda *_: iter([1 / 0]))
+    assert asyncio.run(ask()) == [Failed] * 3 + [octopi.ask("Why?", files[:1]).strip()]

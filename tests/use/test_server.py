@@ -1,7 +1,5 @@
 """`octopi serve` on a real socket: many clients, slow ones, rude ones, and its end; and the demo's command."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -9,7 +7,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,8 +19,7 @@ import pytest
 
 from pipeline.use.serve import make_app
 from pipeline.videos.catalogue import load_catalogue
-from tests.closure import ROOT
-from tests.conftest import HUNG, wait_until_ended
+from tests.conftest import HUNG, ROOT, wait_for, wait_until_ended
 from tests.use.fake import CHAT, FakeOctopi, body, digest, events, part, running, said, text, user
 from tests.use.shared import Made
 from tests.use.videos import video
@@ -30,7 +27,6 @@ from tests.use.videos import video
 
 @contextmanager
 def serving(fake: FakeOctopi, **options: Any) -> Iterator[str]:
-    """The address of a server of that model."""
     with running(make_app(fake, "octopi", **options)) as port:
         yield f"http://127.0.0.1:{port}"
 
@@ -54,15 +50,7 @@ def listens(address: str) -> bool:
     return True
 
 
-def wait_for(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + HUNG
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
 def test_no_answer_of_many_clients_is_lost_or_mixed_up() -> None:
-    """Each question and each video is its own, so any answer that went astray shows."""
     jobs = [(i, video(i % 10, 4 + i // 10)) for i in range(60)]
     assert len({digest(data) for _, data in jobs}) == 60
 

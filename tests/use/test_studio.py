@@ -1,11 +1,9 @@
 """The studio: a camera that is odd in every way, and the whole page in a real browser, killed in the middle."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,21 +17,13 @@ from pipeline.use.studio import Sensor
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.film import write_film
 from pipeline.videos.importing.presses import Shot
-from tests.closure import ROOT
-from tests.conftest import HUNG
-from tests.models import model_folder
+from tests.checkpoints import model_folder
+from tests.conftest import HUNG, ROOT, wait_for
 from tests.use.browser import Tab, tab
 from tests.use.test_live import Camera
 from tests.use.videos import recording
 
 CLASSES = {"foam": (0, 1, 0), "brick": (2, 2, 0), "toy_brick": (2, 0, 2)}
-
-
-def until(true: Callable[[], object]) -> None:
-    end = time.monotonic() + HUNG
-    while not true():
-        assert time.monotonic() < end
-        time.sleep(0.02)
 
 
 def test_what_is_odd_about_camera_gel_and_press_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -56,9 +46,9 @@ def test_what_is_odd_about_camera_gel_and_press_is_said(monkeypatch: pytest.Monk
     monkeypatch.setattr(live, "PAUSE", 0.0)
     monkeypatch.setattr(studio, "AGAIN", 0.1)
     sensor = Sensor("0", 2.0, lambda odd, press: told.append((odd, press)))
-    until(lambda: any("says 60" in note for note in sensor.notes()))
-    until(lambda: len(opened) > 1)
-    until(lambda: any("changed by +" in note for note in sensor.notes()))
+    wait_for(lambda: any("says 60" in note for note in sensor.notes()))
+    wait_for(lambda: len(opened) > 1)
+    wait_for(lambda: any("changed by +" in note for note in sensor.notes()))
     sensor.close()
     found = [(odd.partition(":")[0].partition(",")[0], bool(press)) for odd, press in told]
     assert found == [("", True), ("too weak", False), ("too short", False), ("cut off before the release", True)]

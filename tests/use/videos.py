@@ -1,7 +1,5 @@
 """Small videos in memory, honest ones and crafted ones."""
 
-from __future__ import annotations
-
 import base64
 import struct
 from collections.abc import Sequence

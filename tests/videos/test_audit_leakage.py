@@ -1,7 +1,5 @@
 """What the audit finds that parts share, and what tells a label without touch."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -185,7 +183,6 @@ def planted(
 
 @pytest.mark.parametrize("seed", range(3))
 def test_predictability_is_ridge_regression_fold_by_fold(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
-    """One a fold and an order, by scikit-learn."""
     monkeypatch.setattr(leakage, "PERMUTATIONS", 5)
     features, labels, objects = planted(seed, leak=0.7, dims=(4, 40, 144)[seed])
     found, null = predictability(features, labels, objects, seed)
@@ -223,7 +220,6 @@ def test_constant_features_are_no_division_by_zero() -> None:
 
 @pytest.mark.parametrize(("sample", "leak"), [(leakage.SAMPLE, 1.0), (leakage.SAMPLE, 0.0), (50, 1.0)])
 def test_a_picture_that_tells_the_label_is_a_warning(monkeypatch: pytest.MonkeyPatch, sample: int, leak: float) -> None:
-    """Where untouched pictures depend on the object's hardness; also where few of very many videos are predicted."""
     monkeypatch.setattr(leakage, "PERMUTATIONS", 200)
     monkeypatch.setattr(leakage, "SAMPLE", sample)
     rng = np.random.default_rng(0)
@@ -246,7 +242,6 @@ def test_a_picture_that_tells_the_label_is_a_warning(monkeypatch: pytest.MonkeyP
 
 
 def test_what_cannot_be_predicted_is_undefined() -> None:
-    """Of too few objects, and where all have one class."""
     few = leaks(probes(2, OBJECTS[:4]), {}, OTHER)
     same = leaks(probes(), {}, made.relabelled(OTHER, ratings=((0, 0), (1, 1), (2, 2))))
     for findings in (few, same):

@@ -1,7 +1,5 @@
 """What comes out of the decoder and how frames become squares, against OpenCV, PIL and the textbook's colours."""
 
-from __future__ import annotations
-
 import multiprocessing
 import shutil
 import struct
@@ -160,7 +158,6 @@ def test_of_two_tracks_the_default_is_read(tmp_path: Path, default: int) -> None
 
 
 def test_what_is_no_video_has_no_frames(tmp_path: Path) -> None:
-    """Nor have a folder, what is not there, and sound alone."""
     for number, content in enumerate((b"", b"no video at all " * 40, b"RIFF\0\0\0\0AVI LIST", bytes(5000))):
         (tmp_path / f"{number}.mov").write_bytes(content)
     with av.open(str(tmp_path / "v.mkv"), "w") as container:

@@ -1,7 +1,5 @@
 """The extraction as a whole: what lies in its files, how it goes on after a kill, and what hard videos do to it."""
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import math
@@ -28,20 +26,9 @@ from pipeline.videos.frames.reference import reference_indices
 from pipeline.videos.frames.scan import Scan, scan
 from pipeline.videos.frames.selection import kept_count
 from pipeline.videos.records import Finding, Frame, Probe
+from tests import frame_rules
 from tests.conftest import encode, moving_square, not_utf8, refused, write_video
-from tests.frame_rules import (
-    CONFIG,
-    FILES,
-    Place,
-    constant,
-    frames_of,
-    luma,
-    pressing,
-    promising,
-    published,
-    salience,
-    scanned,
-)
+from tests.frame_rules import CONFIG, FILES, Place, constant, frames_of, luma, pressing, promising, salience, scanned
 
 NAMES = ["baseball_0", "baseball_1", "baseball_10", "potato_0", "potato_2", "rug_0", "rug_1"]
 """The videos of `tiny_videos`, sorted by object and number."""
@@ -184,9 +171,6 @@ def test_an_error_names_its_video_and_keeps_what_is_finished(place: Place) -> No
     place.decoded()
     assert len(place.extract().videos) == 7
     assert not {*NAMES[:4]} & {*place.decoded()}, "what stands before it is finished, and perhaps more"
-
-
-def test_names_that_are_no_text_are_named(place: Place) -> None:
     (place.folder / "rug_0.avi").rename(not_utf8(place.folder, "rug_?_0.avi"))
     with refused(r"rug_\\udcff_0\.avi: its name is no text in UTF-8; rename it"):
         place.extract()
@@ -201,7 +185,7 @@ def test_short_videos_are_left_out_by_the_published_rule(place: Place, caplog: p
     assert len([r for r in caplog.records if "too few" in r.message]) == 5
     for video in found.videos:
         own = [(f.frame_index, int(f.score)) for f in found.frames if f.video_id == video.video_id]
-        assert own == published(place.folder / video.path, video.frames)
+        assert own == frame_rules.published(place.folder / video.path, video.frames)
     assert len(np.load(place.out / "references.npy")) == 2
 
 

@@ -57,9 +57,7 @@ def test_episodes_are_copied_to_the_frame(layout: str, tmp_path: Path) -> None:
 
 
 @by_layout
-def test_a_second_call_goes_on_and_keeps_what_a_person_added(
-    layout: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_second_call_keeps_what_a_person_added(layout: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     out, listed, names = tmp_path / "out", tmp_path / "out/videos.csv", tmp_path / "names.csv"
     names.write_text("task,object_id\npress the mug,mug\n")
     assert len(import_episodes(DATASETS / layout, GEL, out, names, 4.0, pressed=False)) == 1
@@ -91,9 +89,7 @@ def test_each_press_becomes_a_video(layout: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("options", ["keyint=250", "keyint=12:min-keyint=12:open-gop=1"])
 @pytest.mark.parametrize("codec", ["x264", "x265"])
-def test_episodes_that_no_keyframe_begins_are_cut_by_frame(
-    codec: str, options: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_episodes_with_no_keyframe(codec: str, options: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     shutil.copytree(DATASETS / "touch_demo", root := tmp_path / "touch_demo")
     rows = pd.read_parquet(meta := root / "meta/episodes/chunk-000/file-000.parquet")
     rows.assign(**{f"videos/{WRIST}/from_timestamp": [0.0, 1.9999999, 4.8333333]}).to_parquet(meta)  # As sums may be.

@@ -1,7 +1,5 @@
 """Which videos a folder holds, by names or by its videos.csv, and every way in which that may be wrong."""
 
-from __future__ import annotations
-
 import errno
 import os
 import re

@@ -1,7 +1,5 @@
 """What base weights lack, or what is wrong with them, is said in a line: when a scale is chosen, and at loading."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable
@@ -30,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("elsewhere")
 
 ONE = "model.safetensors"
 INDEX = "model.safetensors.index.json"
-CLIP_FILE, CLIP_FORM = "open_clip_model.safetensors", "open_clip_config.json"
+CLIP_FORM = "open_clip_config.json"
 WRITE: dict[str, Callable[[Path], Path]] = {
     "llama": write_llama,
     "shards": partial(write_llama, shard="20KB"),
@@ -172,7 +170,6 @@ def spoil(folder: Path, file: str, name: str) -> None:
 
 
 def disguised(file: Path) -> None:
-    """A pickle under the name of a file of safetensors."""
     torch.save({"a": torch.zeros(1)}, file)
 
 

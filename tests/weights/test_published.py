@@ -1,7 +1,5 @@
 """Downloaded models in their published layouts, at tiny widths: converted, checked, or refused in a line."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 from collections.abc import Callable
@@ -14,17 +12,14 @@ import torch
 from safetensors.torch import load_file, save_file
 from sentencepiece import SentencePieceProcessor, SentencePieceTrainer
 from transformers import AutoTokenizer, LlamaConfig, LlamaForCausalLM
-from typer.testing import CliRunner
 
-from pipeline.cli import app
 from pipeline.language.base import load_llm, load_tokenizer
 from pipeline.scales import compose
 from pipeline.weights import DOWNLOADED
 from pipeline.weights.check import PUBLISHED_LANGUAGE, check_language_files
 from pipeline.weights.make import CATALOGUE
 from tests.checkpoints import CLIP_CONFIG, contents, cut, edit, replace, write_clip
-from tests.closure import ROOT
-from tests.conftest import refused
+from tests.conftest import ROOT, octopi, refused
 
 PICTURES = {"mean": [*open_clip.OPENAI_DATASET_MEAN], "std": [*open_clip.OPENAI_DATASET_STD]}
 WORDS = 600
@@ -68,7 +63,6 @@ def train_pieces(folder: Path, text: str, **how: Any) -> Path:
 
 @pytest.fixture(scope="module")
 def pieces(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A SentencePiece model trained with LLaMA's settings."""
     return train_pieces(tmp_path_factory.mktemp("pieces"), "\n".join(LINES), **LLAMAS_PIECES)
 
 
@@ -110,13 +104,11 @@ def vicuna(pieces: Path) -> Path:
     return folder
 
 
-def octopi(*arguments: str) -> str:
-    return CliRunner().invoke(app, ["weights", *arguments], catch_exceptions=False).output
-
-
 def test_a_downloaded_vicuna_becomes_what_the_chain_reads(vicuna: Path, pieces: Path) -> None:
     before = contents(vicuna)
-    assert "weights/vicuna-7b-v1.5: written, with SHA256SUMS" in octopi("vicuna-7b", str(vicuna), "--trust-pickle")
+    assert "weights/vicuna-7b-v1.5: written, with SHA256SUMS" in octopi(
+        "weights", "vicuna-7b", vicuna, "--trust-pickle"
+    )
     assert contents(vicuna) == before
     assert not list(TO.glob("*.bin*"))
     subprocess.run(["sha256sum", "--check", "--strict", "--quiet", "SHA256SUMS"], cwd=TO, check=True)
@@ -143,18 +135,18 @@ def test_a_downloaded_vicuna_becomes_what_the_chain_reads(vicuna: Path, pieces: 
 
 
 def test_what_was_converted_is_checked_where_it_lies(vicuna: Path) -> None:
-    octopi("vicuna-7b", str(vicuna), "--to", "elsewhere", "--trust-pickle")
+    octopi("weights", "vicuna-7b", vicuna, "--to", "elsewhere", "--trust-pickle")
     before = contents(Path("elsewhere"))
-    assert "elsewhere: checked, with SHA256SUMS" in octopi("vicuna-7b", "elsewhere")
+    assert "elsewhere: checked, with SHA256SUMS" in octopi("weights", "vicuna-7b", "elsewhere")
     assert contents(Path("elsewhere")) == before
-    octopi("vicuna-7b", "elsewhere", "--to", "copy")
+    octopi("weights", "vicuna-7b", "elsewhere", "--to", "copy")
     assert contents(Path("copy")) == before
     with refused("elsewhere has hidden_size 32, but vicuna-13b-v1.5 was published with 5120"):
-        octopi("vicuna-13b", "elsewhere")
+        octopi("weights", "vicuna-13b", "elsewhere")
     cut(Path("elsewhere/model.safetensors"))
     for to in ((), ("--to", "other")):
         with refused("elsewhere/model.safetensors is cut off"):
-            octopi("vicuna-7b", "elsewhere", *to)
+            octopi("weights", "vicuna-7b", "elsewhere", *to)
     assert not list(Path().glob("*other*"))
 
 
@@ -168,7 +160,7 @@ def test_other_files_are_read_too(form: str, vicuna: Path) -> None:
         torch.save(weights(), vicuna / "pytorch_model.bin")
     else:
         save_shards(vicuna, weights(), _use_new_zipfile_serialization=False)
-    octopi("vicuna-7b", str(vicuna), *([] if form == "safetensors" else ["--trust-pickle"]))
+    octopi("weights", "vicuna-7b", vicuna, *([] if form == "safetensors" else ["--trust-pickle"]))
     assert not list(TO.glob("*.bin*"))
     state = load_llm(TO, torch.float16).state_dict()
     assert all(torch.equal(value, state[name]) for name, value in weights().items())
@@ -208,7 +200,7 @@ def test_the_command_refuses_what_it_cannot_do(arguments: str, words: str, vicun
     torch.save({"a": Evil()}, vicuna / FIRST)
     before = contents(Path())
     with refused(words):
-        octopi(*arguments.split())
+        octopi("weights", *arguments.split())
     assert contents(Path()) == before, "nothing is run or written"
 
 
@@ -232,7 +224,7 @@ def clip() -> Path:
 
 def test_a_clip_as_open_clip_has_it_is_checked_where_it_lies(clip: Path) -> None:
     before = contents(clip)
-    assert "clip: checked, with SHA256SUMS" in octopi("clip-vit-large", str(clip))
+    assert "clip: checked, with SHA256SUMS" in octopi("weights", "clip-vit-large", clip)
     assert before.items() < contents(clip).items()
     subprocess.run(["sha256sum", "--check", "--strict", "--quiet", "SHA256SUMS"], cwd=clip, check=True)
 
@@ -259,5 +251,5 @@ def test_a_broken_download_is_one_line_and_leaves_nothing(
     before = contents(Path())
     for to in ((), ("--to", "there")):
         with refused(words):
-            octopi(model, str(folder), "--trust-pickle", *to)
+            octopi("weights", model, folder, "--trust-pickle", *to)
     assert contents(Path()) == before
