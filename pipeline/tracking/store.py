@@ -162,11 +162,12 @@ class Store:
         return run
 
     def log(self, run: str, metrics: Sequence[tuple[str, float, int, int]]) -> None:
-        """Add metrics: name, value, time and step."""
+        """Add metrics: name, value, time and step. In a name, what MLflow does not take becomes a colon."""
         from mlflow.entities import Metric
 
+        taken = [Metric(re.sub(r"[^\w\-./: ]", ":", name), *rest) for name, *rest in metrics]
         # Synchronous, so that a failure shows here.
-        self.client.log_batch(run, [Metric(*metric) for metric in metrics], synchronous=True)
+        self.client.log_batch(run, taken, synchronous=True)
 
     def finish(self, run: str, end: int, tags: Mapping[str, str]) -> None:
         """Add the tags by which a run is known to be whole, and end it."""
