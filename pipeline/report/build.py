@@ -227,7 +227,8 @@ def described_frame(
             row[f"{c.property}, probability"] = round(c.probabilities[c.predicted], 4)
     for key, row in rows.items():
         row["sentence"] = sentences.get(key, "")
-    return pd.DataFrame(rows.values())
+    # A table without rows has a head all the same.
+    return pd.DataFrame(rows.values() if rows else {"seed": [], "video_id": []})
 
 
 def curves_frame(root: Path, ablation: AblationConfig) -> pd.DataFrame:

@@ -116,6 +116,10 @@ def curve() -> list[str]:
 def test_the_learning_curve_of_the_documents_is_that_of_the_report() -> None:
     document = (ROOT / "docs" / "data.md").read_text(encoding="utf-8")
     assert "\n".join(curve()) in document
+    trained = load_report(ROOT / "reports" / "small-videos").scores.query(f"seed == {ALL_SEEDS!r} and task == 'OPD'")
+    full = trained.query("measure == 'combined' and encoder == 'finetuned' and lora == 'with' and touch == 'real'")
+    (best,) = full[full["opd"] == "all"]["accuracy"]
+    assert f"describes better than an adapted one, {100 * best:.1f} %" in document
 
 
 def test_its_llm_is_made_once(
