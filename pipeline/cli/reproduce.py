@@ -25,6 +25,10 @@ INTERRUPTED = ("exited with 130", "exited with -2")
 """How DVC's error ends for a stage that Ctrl-C ended, the second where it had hardly begun or was at its end."""
 
 
+SHOWN = ("accuracy", "low", "high", "chance")
+"""Shares in scores.csv, of which some are empty where there are too few questions."""
+
+
 def outdated(root: Path) -> tuple[dict[str, list[str]], int, bool]:
     """The stages that will run at the most, each with those it waits for; how many stages there are; if outputs are.
 
@@ -104,8 +108,10 @@ def right_answers(file: Path, model: str | None) -> Iterator[str]:
         rows = [r for r in csv.DictReader(stream) if (r["encoder"], r["lora"], r["touch"]) == whose]
     found = {r["task"]: r for r in rows if r["seed"] == "all" and r["measure"] in ("choice", "combined")}
     for name in (task for task in TASKS if task in found):
-        right, low, high, chance = (f"{100 * float(found[name][k]):.0f}" for k in ("accuracy", "low", "high", "chance"))
-        yield f"  {TASKS[name].title}: {right} % right [{low}, {high}] of {found[name]['n']}, guessing {chance}"
+        row = {key: f"{100 * float(cell):.0f}" if cell else "" for key, cell in found[name].items() if key in SHOWN}
+        interval = f" [{row['low']}, {row['high']}]" if row["low"] else ""
+        chance = f", guessing {row['chance']}" if row["chance"] else ""
+        yield f"  {TASKS[name].title}: {row['accuracy']} % right{interval} of {found[name]['n']}{chance}"
 
 
 def reproduce(root: Path, arguments: list[str]) -> int:
