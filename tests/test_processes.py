@@ -150,6 +150,15 @@ def test_a_killed_chain_leaves_no_process_of_dvcs_and_goes_on(here: Path, number
         left.kill()
 
 
+@pytest.mark.skipif(cores() < 2, reason="needs two cores")
+def test_a_killed_process_of_dvcs_is_one_line(here: Path) -> None:
+    repository(here, "stages: {first: {cmd: kill -9 $PPID}, second: {cmd: 'true'}}")
+    ended = subprocess.run(["octopi", "repro"], env=ENVIRONMENT, text=True, capture_output=True, check=False)
+    assert ended.returncode == 1
+    assert ended.stderr.splitlines()[-1].endswith("killed; finished stages stay, call `octopi repro` again")
+    assert "Traceback" not in ended.stderr
+
+
 @pytest.mark.parametrize("body", [SLEEPING, TELLING])
 def test_ctrl_c_ends_the_processes_of_a_stage(tmp_path: Path, body: str) -> None:
     (tmp_path / "stages").mkdir()

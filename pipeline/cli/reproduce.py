@@ -8,6 +8,7 @@ import os
 import signal
 from collections.abc import Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from graphlib import TopologicalSorter
 from multiprocessing import get_context
 from pathlib import Path
@@ -66,6 +67,9 @@ def side_by_side(waits: Mapping[str, list[str]], at_once: int) -> int:
 
     Returns:
         0, or the exit status of a stage that failed, of which it said a line; the others that ran have ended.
+
+    Raises:
+        UserError: where a process of DVC's dies.
     """
     order = TopologicalSorter(waits)
     order.prepare()
@@ -83,6 +87,9 @@ def side_by_side(waits: Mapping[str, list[str]], at_once: int) -> int:
         if any(not job.cancelled() and job.result() for job in running):
             return 130  # The stage that was stopped has said so.
         raise
+    except BrokenProcessPool:
+        # The system ends a process where memory is short.
+        raise UserError("a process of DVC's was killed; finished stages stay, call `octopi repro` again") from None
     finally:
         pool.shutdown(cancel_futures=True)
     return 0
