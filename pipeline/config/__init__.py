@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, Strict, field_validator, model_validator
 
@@ -73,7 +73,7 @@ class ScenesConfig(Section):
     videos_per_object: Positive = 5
     frames: Annotated[Whole, Field(ge=2, le=1000)] = 100
     """Frames a video."""
-    fps: Annotated[Number, Field(gt=0, le=240)] = 25.0
+    fps: ClassVar[float] = 25.0
     """Frames a second."""
     tier: Literal["auto", "winkler", "layer", "half_space"] = "auto"
     """How a contact is computed: on springs, with the gel as an elastic layer or as a half-space; `auto` takes what is
@@ -117,8 +117,6 @@ class SplitConfig(Section):
     includes all objects of a smaller one."""
     folds: Annotated[Whole, Field(ge=3, le=50)] = 5
     """`kfold`: number of folds. Seed s of `ablation.seeds` tests on fold s modulo `folds`."""
-    missing: Literal["report", "error"] = "report"
-    """What to do about validation or test objects without videos: go on and leave cells empty, or stop."""
 
     @model_validator(mode="after")
     def _fewer_objects_of_folds(self) -> Self:
@@ -238,18 +236,16 @@ class PretrainConfig(Section):
 
     objects: Annotated[Whole, Field(ge=8, le=1_000_000)] = 4000
     """Objects that are invented; each is drawn once."""
-    presses: Annotated[Whole, Field(ge=1, le=64)] = 3
-    """Pictures of each, under different forces and lights."""
     steps: Positive = 900
     """Updates (AdamW, cosine)."""
-    batch_size: Positive = 24
-    """Objects an update."""
-    learning_rate: Rate = 2e-3
-    weight_decay: Annotated[Number, Field(ge=0, lt=1)] = 0.01
-    max_grad_norm: GradNorm = 1.0
-    augment: bool = True
-    """Vary how strong each picture's light is, and mirror it."""
     seed: Seed = 0
+    presses: ClassVar[int] = 3
+    """Pictures of each object, under different forces and lights."""
+    batch_size: ClassVar[int] = 24
+    """Objects an update."""
+    learning_rate: ClassVar[float] = 2e-3
+    weight_decay: ClassVar[float] = 0.01
+    max_grad_norm: ClassVar[float] = 1.0
 
 
 class LanguageConfig(Section):

@@ -104,7 +104,7 @@ def pretrain(
     """
     seed_everything(config.seed)
     frames = frames.model_copy(update={"pixels": min(frames.pixels, SIDE)})
-    shown = repr((config.objects, config.presses, config.seed))
+    shown = repr((config.objects, config.seed))
     drawn = draw_pictures(config, frames, checkpoint_dir("pretrain", "pictures", shown, frames.fit, frames.pixels))
     # The loss is measured at the end on a share of the objects.
     border = len(drawn.pictures) - max(1, round(0.04 * len(drawn.pictures)))
@@ -125,7 +125,7 @@ def pretrain(
     trainer = TrainableTrainer(
         model=model,
         args=arguments,
-        train_dataset=PretrainingDataset(training, augment=config.augment, seed=config.seed),
+        train_dataset=PretrainingDataset(training, augment=True, seed=config.seed),
         callbacks=callbacks,
     )
     history = train(trainer).history

@@ -43,8 +43,7 @@ def assign_objects(
     videos. Only the split of kfold depends on `seed` (one of `ablation.seeds`).
 
     Raises:
-        UserError: if there is no such split, no training video remains, there are too few objects for the folds asked
-            for, or (with `missing: error`) a validation or test object has no video.
+        UserError: if there is no such split, no training video remains, or there are too few objects for the folds.
     """
     name, allowed = config.name, [*catalogue.split_names, "kfold"]
     if name not in allowed:
@@ -56,10 +55,6 @@ def assign_objects(
         parts = _deal(catalogue, present, config, fold)
     else:
         parts = {o.object_id: o.splits[name] for o in catalogue.objects.values()}
-    if config.missing == "error" and (lacking := without_videos(parts, present)):
-        raise UserError(
-            f"split.name={name}: {lacking}; add videos to data.dir, or set split.missing=report to go on without them"
-        )
     if not any(parts.get(object_id) == Part.TRAIN for object_id in present):
         raise UserError(f"split {name}: no video of a training object; add videos, or choose another split.name")
     return parts
@@ -72,17 +67,7 @@ def few(parts: Mapping[str, Part], present: Collection[str]) -> str:
 
 
 def untested(parts: Mapping[str, Part], present: Collection[str]) -> str:
-    """In words, which objects have videos but no part, and whether any is for test; empty where all is well."""
-    said = [without_videos(parts, present)]
-    if spare := sorted(o for o in present if parts.get(o, Part.UNUSED) is Part.UNUSED):
-        said.append(f"{len(spare)} with videos are in no part ({', '.join(spare)}): objects.csv gives parts")
-    if not any(parts.get(o) is Part.TEST for o in present):
-        said.append("so nothing can be asked; split.name=kfold tests every object that has videos")
-    return "; ".join(filter(None, said))
-
-
-def without_videos(parts: Mapping[str, Part], present: Collection[str]) -> str:
-    """In words, how many test and validation objects have no videos, and which; empty where all have some."""
+    """In words, which objects have a part but no videos, or the reverse, and whether any is for test; else empty."""
     said = []
     for part in (Part.TEST, Part.VALIDATION):
         known = sorted(o for o, own in parts.items() if own == part)
@@ -90,6 +75,10 @@ def without_videos(parts: Mapping[str, Part], present: Collection[str]) -> str:
             said.append(f"{len(lacking)} of {len(known)} {part} objects have no videos ({', '.join(lacking)})")
         elif not known and part is Part.TEST:
             said.append("no object is for test")
+    if spare := sorted(o for o in present if parts.get(o, Part.UNUSED) is Part.UNUSED):
+        said.append(f"{len(spare)} with videos are in no part ({', '.join(spare)}): objects.csv gives parts")
+    if not any(parts.get(o) is Part.TEST for o in present):
+        said.append("so nothing can be asked; split.name=kfold tests every object that has videos")
     return "; ".join(said)
 
 

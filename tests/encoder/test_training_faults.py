@@ -188,7 +188,7 @@ def noise(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def pretrained(steps: int, saved: int, objects: int = 16, side: int = 16) -> tuple[list[Measurement], SceneEncoder]:
-    setting = PretrainConfig(objects=objects, presses=2, steps=steps, batch_size=4)
+    setting = PretrainConfig(objects=objects, steps=steps)
     encoder, history = pretrain(setting, FramesConfig(pixels=side), RuntimeConfig(device="cpu", save_steps=saved))
     return history, encoder
 
