@@ -33,11 +33,6 @@ PAIRS = {
         "grip": ({BRUSH, TOWEL}, {CLOTH, ORANGE, ERASER}),
         "ice": ({HANDLE, BRISTLES}, {CLOTH, TOWEL, ORANGE, ERASER, BRUSH}),
     },
-    ("paper", "published"): {
-        "stains": ({CLOTH}, {BRISTLES}),
-        "grip": ({BRUSH, TOWEL}, {CLOTH}),
-        "ice": ({HANDLE, BRISTLES, ICE, PEG}, {CLOTH, TOWEL, BRUSH}),
-    },
     ("paper", "ours"): {
         "stains": ({CLOTH}, {HANDLE, BRISTLES, ICE, PEG}),
         "grip": ({BRUSH, TOWEL, BRISTLES}, {HANDLE, ICE}),
