@@ -25,6 +25,7 @@ from pipeline.encoder.synthetic import SyntheticPictures
 from pipeline.training.trainable import trainable_state
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
+from tests.checkpoints import cut
 from tests.conftest import Begun, refused
 from tests.encoder.conftest import Hook, gradient, killed_at, relabelled, setting_of
 from tests.encoders import PARTS, encoder_data, training
@@ -143,10 +144,6 @@ def unwritten(file: Path) -> None:
     file.write_bytes(b"")
 
 
-def cut(file: Path) -> None:
-    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-
-
 def flip(file: Path) -> None:
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 0xFF
@@ -164,7 +161,8 @@ def test_a_damaged_checkpoint_is_passed_over(
     with pytest.raises(KeyboardInterrupt):
         run()
     shutil.copytree(tmp_path / "checkpoints", tmp_path / "kept")
-    damages = {"model.safetensors": unwritten, "optimizer.pt": cut, "rng_state.pth": flip, "trainer_state.json": cut}
+    damages = {"model.safetensors": unwritten, "optimizer.pt": cut, "rng_state.pth": flip}
+    damages["trainer_state.json"] = partial(cut, by=9)
     for name, damage in damages.items():
         shutil.copytree(tmp_path / "kept", tmp_path / "checkpoints", dirs_exist_ok=True)
         (last,) = tmp_path.glob("checkpoints/*/*/checkpoint-6")
@@ -228,13 +226,12 @@ def test_a_training_goes_on_only_with_its_own_settings_labels_and_objects(
 ) -> None:
     rated = data.assignments[0].object_id
     exchanged = [a.model_copy(update={"part": Part.TEST}) if a.object_id == rated else a for a in data.assignments]
-    usual = begun_in(lambda: trained("paper", weights, data))
-    assert begun_in(lambda: trained("paper", weights, data)) == usual
-    places = [
-        begun_in(lambda: trained("paper", weights, data, epochs=7)),
-        begun_in(lambda: trained("paper", weights, relabelled(data, rated))),
-        begun_in(lambda: trained("paper", weights, replace(data, assignments=exchanged))),
-    ]
+
+    def begun(held: EncoderData = data, **changes: object) -> str:
+        return begun_in(lambda: trained("paper", weights, held, **changes))
+
+    places = [begun(epochs=7), begun(relabelled(data, rated)), begun(replace(data, assignments=exchanged))]
+    usual, again = begun(), begun()
     versions("pipeline/encoder/model.py")
-    places.append(begun_in(lambda: trained("paper", weights, data)))
-    assert len({usual, *places}) == 5
+    assert usual == again
+    assert len({usual, *places, begun()}) == 5
