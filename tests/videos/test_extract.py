@@ -75,7 +75,7 @@ def test_files_hold_what_the_table_says(place: Place) -> None:
     assert list(place.partial.iterdir()) == []
 
 
-def kill_after(count: int, place: Place, config: FramesConfig = CONFIG) -> None:
+def kill_after(count: int, place: Place) -> None:
     """Interrupt an extraction when one process has scanned the next `count` videos."""
 
     def until(work: Callable[[Any], Any], jobs: Sequence[Any], *_: str) -> Iterator[Any]:
@@ -83,7 +83,7 @@ def kill_after(count: int, place: Place, config: FramesConfig = CONFIG) -> None:
         raise KeyboardInterrupt
 
     with patch.object(extract, "run_parallel", until), pytest.raises(KeyboardInterrupt):
-        place.extract(config)
+        place.extract()
 
 
 @pytest.fixture(scope="module")
