@@ -175,16 +175,6 @@ def test_a_damaged_checkpoint_is_passed_over(
         same(whole, again)
 
 
-@pytest.fixture
-def noise(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Noise in place of scenes, with something to tell of it."""
-    rng = np.random.default_rng(0)
-    pictures = rng.integers(0, 256, (16, 2, 16, 16, 3), dtype=np.uint8)
-    quantities, kinds = rng.normal(size=(16, 2, 5)), rng.integers(0, 2, (16, 4))
-    made = SyntheticPictures(pictures, quantities.astype(np.float32), kinds.astype(np.uint8))
-    monkeypatch.setattr(pretraining, "draw_pictures", lambda *_: made)
-
-
 def pretrained(steps: int, saved: int, objects: int = 16, side: int = 16) -> tuple[list[Measurement], SceneEncoder]:
     setting = PretrainConfig(objects=objects, steps=steps)
     encoder, history = pretrain(setting, FramesConfig(pixels=side), RuntimeConfig(device="cpu", save_steps=saved))
@@ -192,9 +182,14 @@ def pretrained(steps: int, saved: int, objects: int = 16, side: int = 16) -> tup
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("noise")
-def test_what_diverges_between_two_reports_replaces_no_good_checkpoint(tmp_path: Path, before_updates: Hook) -> None:
-    """Reports come every second update, checkpoints after each."""
+def test_what_diverges_between_two_reports_replaces_no_good_checkpoint(
+    tmp_path: Path, before_updates: Hook, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Reports come every second update, checkpoints after each; with noise in place of scenes."""
+    rng = np.random.default_rng(0)
+    pictures = rng.integers(0, 256, (16, 2, 16, 16, 3), dtype=np.uint8)
+    made = SyntheticPictures(pictures, rng.normal(size=(16, 2, 5)).astype(np.float32), np.eye(16, 4, dtype=np.uint8))
+    monkeypatch.setattr(pretraining, "draw_pictures", lambda *_: made)
 
     def poison(update: int, optimizer: torch.optim.Optimizer) -> None:
         if update == 4:
