@@ -100,6 +100,9 @@ def test_a_class_that_training_lacks_is_all_but_impossible(kept: tuple[int, ...]
     assert 0 < found[:, lacking].min() <= found[:, lacking].max() < 1e-3
     assert found.sum(axis=1) == pytest.approx(1)
     assert set(heads.predict(unseen)[:, 0].tolist()) <= set(kept)
+    heads.copy_into(model := JointFrameClassifier(FrameEncoder(6), [4, 2]))
+    logits = torch.cat(model.classify(torch.from_numpy(unseen)), dim=1)
+    assert (model.decide(logits).numpy() == heads.predict(unseen)).all(), "the model decides alike"
     if len(kept) == 2:
         probabilities, present = reference(clips, labels[:, 0], STRENGTHS[-1])
         assert tuple(present) == kept
