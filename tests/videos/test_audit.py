@@ -16,7 +16,7 @@ from pipeline.core.io import read_csv, write_table
 from pipeline.core.records import Part
 from pipeline.scales import write_params
 from pipeline.videos.audit import leakage
-from pipeline.videos.audit.files import check_files
+from pipeline.videos.audit.files import by_rate, check_files
 from pipeline.videos.audit.labels import check_labels, icc3k
 from pipeline.videos.audit.leakage import check_leakage, sessions
 from pipeline.videos.audit.run import audit_chain, audit_folder, check_folder
@@ -197,6 +197,13 @@ def test_time_stamps_that_jitter_are_one_rate_and_hide_nothing(seed: int) -> Non
     findings = sorted((f.check, f.item) for f in odd(check_files(found, OTHER)))
     assert findings == [("brightness", "potato_3.mov"), ("length", "orange_7.mov")]
     assert len(set(sessions(found))) == 1
+
+
+def test_rates_that_cameras_have_stay_apart() -> None:
+    """None is taken for its neighbour, among them what a container without a rate is given."""
+    cameras = [0.0, 5.0, 10.0, 12.5, 15.0, 20.0, 24.0, 25.0, 29.97, 48.0, 50.0, 60.0, 90.0, 120.0]
+    groups = by_rate([probe(f"rug_{i}", fps=rate) for i, rate in enumerate(cameras * 2)])
+    assert {rate: len(group) for rate, group in groups.items()} == dict.fromkeys(cameras, 2)
 
 
 def test_brightness_is_judged_by_the_spread_at_the_same_rate() -> None:
