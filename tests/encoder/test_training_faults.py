@@ -25,6 +25,7 @@ from pipeline.encoder.synthetic import SyntheticPictures
 from pipeline.training.trainable import trainable_state
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
+from tests.checkpoints import cut
 from tests.conftest import Begun, refused
 from tests.encoder.conftest import Hook, gradient, killed_at, relabelled, setting_of
 from tests.encoders import PARTS, encoder_data, training
@@ -143,10 +144,6 @@ def unwritten(file: Path) -> None:
     file.write_bytes(b"")
 
 
-def cut(file: Path) -> None:
-    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-
-
 def flip(file: Path) -> None:
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 0xFF
@@ -164,7 +161,8 @@ def test_a_damaged_checkpoint_is_passed_over(
     with pytest.raises(KeyboardInterrupt):
         run()
     shutil.copytree(tmp_path / "checkpoints", tmp_path / "kept")
-    damages = {"model.safetensors": unwritten, "optimizer.pt": cut, "rng_state.pth": flip, "trainer_state.json": cut}
+    damages = {"model.safetensors": unwritten, "optimizer.pt": cut, "rng_state.pth": flip}
+    damages["trainer_state.json"] = partial(cut, by=9)
     for name, damage in damages.items():
         shutil.copytree(tmp_path / "kept", tmp_path / "checkpoints", dirs_exist_ok=True)
         (last,) = tmp_path.glob("checkpoints/*/*/checkpoint-6")
@@ -177,16 +175,6 @@ def test_a_damaged_checkpoint_is_passed_over(
         same(whole, again)
 
 
-@pytest.fixture
-def noise(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Noise in place of scenes, with something to tell of it."""
-    rng = np.random.default_rng(0)
-    pictures = rng.integers(0, 256, (16, 2, 16, 16, 3), dtype=np.uint8)
-    quantities, kinds = rng.normal(size=(16, 2, 5)), rng.integers(0, 2, (16, 4))
-    made = SyntheticPictures(pictures, quantities.astype(np.float32), kinds.astype(np.uint8))
-    monkeypatch.setattr(pretraining, "draw_pictures", lambda *_: made)
-
-
 def pretrained(steps: int, saved: int, objects: int = 16, side: int = 16) -> tuple[list[Measurement], SceneEncoder]:
     setting = PretrainConfig(objects=objects, steps=steps)
     encoder, history = pretrain(setting, FramesConfig(pixels=side), RuntimeConfig(device="cpu", save_steps=saved))
@@ -194,9 +182,14 @@ def pretrained(steps: int, saved: int, objects: int = 16, side: int = 16) -> tup
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("noise")
-def test_what_diverges_between_two_reports_replaces_no_good_checkpoint(tmp_path: Path, before_updates: Hook) -> None:
-    """Reports come every second update, checkpoints after each."""
+def test_what_diverges_between_two_reports_replaces_no_good_checkpoint(
+    tmp_path: Path, before_updates: Hook, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Reports come every second update, checkpoints after each; with noise in place of scenes."""
+    rng = np.random.default_rng(0)
+    pictures = rng.integers(0, 256, (16, 2, 16, 16, 3), dtype=np.uint8)
+    made = SyntheticPictures(pictures, rng.normal(size=(16, 2, 5)).astype(np.float32), np.eye(16, 4, dtype=np.uint8))
+    monkeypatch.setattr(pretraining, "draw_pictures", lambda *_: made)
 
     def poison(update: int, optimizer: torch.optim.Optimizer) -> None:
         if update == 4:
@@ -228,13 +221,12 @@ def test_a_training_goes_on_only_with_its_own_settings_labels_and_objects(
 ) -> None:
     rated = data.assignments[0].object_id
     exchanged = [a.model_copy(update={"part": Part.TEST}) if a.object_id == rated else a for a in data.assignments]
-    usual = begun_in(lambda: trained("paper", weights, data))
-    assert begun_in(lambda: trained("paper", weights, data)) == usual
-    places = [
-        begun_in(lambda: trained("paper", weights, data, epochs=7)),
-        begun_in(lambda: trained("paper", weights, relabelled(data, rated))),
-        begun_in(lambda: trained("paper", weights, replace(data, assignments=exchanged))),
-    ]
+
+    def begun(held: EncoderData = data, **changes: object) -> str:
+        return begun_in(lambda: trained("paper", weights, held, **changes))
+
+    places = [begun(epochs=7), begun(relabelled(data, rated)), begun(replace(data, assignments=exchanged))]
+    usual, again = begun(), begun()
     versions("pipeline/encoder/model.py")
-    places.append(begun_in(lambda: trained("paper", weights, data)))
-    assert len({usual, *places}) == 5
+    assert usual == again
+    assert len({usual, *places, begun()}) == 5

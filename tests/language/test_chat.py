@@ -214,14 +214,7 @@ def test_a_template_that_cannot_be_trained_on_is_one_line(template: str, tmp_pat
 def test_nothing_that_a_folder_brings_is_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A configuration may name code of its own; transformers would ask, and run it on "y"."""
     ran, folder = tmp_path / "ran", write_llama(tmp_path / "llama")
-    (folder / "own.py").write_text(
-        f"""open({str(ran)!r}, "w").close()
-from transformers import LlamaConfig, LlamaForCausalLM, PreTrainedTokenizerFast
-class Config(LlamaConfig): model_type = "own"
-class Model(LlamaForCausalLM): config_class = Config
-class Tokenizer(PreTrainedTokenizerFast): pass
-"""
-    )
+    (folder / "own.py").write_text(f'open({str(ran)!r}, "w").close()')
     model, tokenizer = {"AutoConfig": "own.Config", "AutoModelForCausalLM": "own.Model"}, [None, "own.Tokenizer"]
     edit(folder / "config.json", model_type="own", auto_map=model)
     edit(folder / "tokenizer_config.json", tokenizer_class="Tokenizer", auto_map={"AutoTokenizer": tokenizer})

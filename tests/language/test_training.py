@@ -24,7 +24,7 @@ from pipeline.language.lora import add_lora
 from pipeline.language.training import Job, Material, assemble, fit, write_model_card
 from pipeline.scales import compose
 from pipeline.training.embeddings import STATISTICS_FILE, EmbeddingStore
-from pipeline.training.trainer import Trained, training_arguments
+from pipeline.training.trainer import Trained
 from tests.checkpoints import contents, write_llama
 from tests.conftest import ROOT, Begun, refused
 from tests.language.conftest import (
@@ -244,17 +244,6 @@ def test_accelerate_may_not_compute_otherwise_than_the_parameters_say(
     monkeypatch.setenv(name, value)
     with refused(words):
         run("align", held, checkpoints)
-
-
-def test_threads_are_the_parameters_where_torch_was_imported_late(tmp_path: Path) -> None:
-    """A stage limits them when it begins, and imports torch after that."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(3)
-    try:
-        training_arguments(tmp_path, RuntimeConfig(device="cpu", threads=2), 0, SMALL)
-        assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("tied", [False, True])

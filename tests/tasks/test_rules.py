@@ -191,7 +191,6 @@ COMPARED = {
     "Conclusion: Yes.": (True, False),
     f"Conclusion: {VERDICT.lower()}": (True, False),
     VERDICT: (True, True),
-    f"conclusion: {VERDICT}": (True, False),
     f"Conclusion: No. Conclusion: {VERDICT} No.": (True, True),
     "Conclusion: No, the second object is harder.": (False, False),
 }

@@ -33,11 +33,6 @@ PAIRS = {
         "grip": ({BRUSH, TOWEL}, {CLOTH, ORANGE, ERASER}),
         "ice": ({HANDLE, BRISTLES}, {CLOTH, TOWEL, ORANGE, ERASER, BRUSH}),
     },
-    ("paper", "published"): {
-        "stains": ({CLOTH}, {BRISTLES}),
-        "grip": ({BRUSH, TOWEL}, {CLOTH}),
-        "ice": ({HANDLE, BRISTLES, ICE, PEG}, {CLOTH, TOWEL, BRUSH}),
-    },
     ("paper", "ours"): {
         "stains": ({CLOTH}, {HANDLE, BRISTLES, ICE, PEG}),
         "grip": ({BRUSH, TOWEL, BRISTLES}, {HANDLE, ICE}),
@@ -145,9 +140,7 @@ def test_a_hand_that_only_presses_turns_nothing() -> None:
         pressed, twisted = (make_motion(50, np.random.default_rng(seed), twist=twist) for twist in (False, True))
         assert set(pressed.angle) == {twisted.angle[0]}
         assert len(set(twisted.angle)) > 1
-        # No hand lets go in the first half; until then a twisting one presses less and less.
-        assert (pressed.force[:26] >= twisted.force[:26] - 1e-12).all()
-        assert pressed.force[25] == pressed.force.max() > 0
+        assert pressed.force[25] == pressed.force.max() > 0, "no hand lets go in the first half"
 
 
 def about(**parts: Part) -> dict[str, Question]:

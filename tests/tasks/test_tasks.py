@@ -169,7 +169,6 @@ UNREAD = {
     "PC": """
         The first object is harder.
         Yesterday
-        Yes and no.
         Conclusion: No / yes
         **No** answer can be given.
         Conclusion: Yes. Answer: No.
@@ -182,11 +181,9 @@ UNREAD = {
         a) is the same as b).
         The hardest is **a)** or **b)**.
         Answer: A human cannot tell.
-        Conclusion: a), b) or c)
         Conclusion: a) is soft, b) is hard, c) is hard.
         Conclusion: a b)
         a. The surface feels hard.
-        Conclusion: **a)**. Answer: **b)**.
         Answer: b) Conclusion: I cannot tell.
         None of **b)**
         """,
@@ -196,7 +193,6 @@ UNREAD = {
         The riper kiwi is a).
         """,
     "PSR": """
-        The most suitable object is a) or b).
         The object is a).
         Neither a) nor b) is the most suitable.
         I do not think that b) is the most suitable.
@@ -217,7 +213,6 @@ READ = {
         Conclusion: **b)** is the hardest.
         Option B is the hardest.
         Answer: b
-        The hardest object is b).
         B.
         \\boxed{b}
         **Conclusion:** b), because a) is soft
@@ -232,7 +227,6 @@ READ = {
         The most suitable object for cleaning a pan without scratching it is b).
         b) is the best choice.
         Option B
-        The most suitable object is: b)
         the most suitable object is Object b
         """,
     ("RIPE", "b"): """
@@ -266,19 +260,16 @@ PLAIN = ("a lanyard's card holder", "a baseball", "a lemon")
     ("names", "output", "verdict"),
     [
         (PLAIN, "a) is {a}, b) is {b} and c) is {c}.", True),
-        (PLAIN, "**Conclusion:** **a)** is **{a}**, **b)** is *{b}* and c) is `{c}`.", True),
         (PLAIN, "- a) {a}\n- b) {b}\n- c) {c}", True),
         (PLAIN, "(a) is “{a}”, (b) is '{b}', (c) is \"{c}\".", True),
         (PLAIN, "Option A is a lanyard\N{RIGHT SINGLE QUOTATION MARK}s card holder, B is {b} and C is {c}", True),
         (PLAIN, "\\boxed{{a) = {a}, b) = {b}, c) = {c}}}", True),
-        (PLAIN, "1. a) → {a}\n2. b) → {b}\n3. c) → {c}", True),
         (PLAIN, "a) is {b}, b) is {a} and c) is {c}.", False),
         (PLAIN, "a) is {a}, b) is {b}.", None),
         (PLAIN, "a) is {a}, b) is {b} and c) is {b}.", None),
         (PLAIN, "a) is {a}, a) is {a}, b) is {b} and c) is {c}.", None),
         (PLAIN, "{a}, {b}, {c}", None),
         (PLAIN, "a) is not {a}, b) is {b} and c) is {c}.", None),
-        (PLAIN, "a) {a} or {b}, b) {b}, c) {c}", None),
         (PLAIN, "a) is {a}, b) or c) is {c}", None),
         (("a lanyard", "a tomato", "a potato"), "a) is {a}, b) is {b} and c) is {c}.", True),
         (("a lanyard", "a tomato", "a potato"), "a) is a lanyard's card holder, b) is {b} and c) is {c}.", None),
