@@ -1,7 +1,6 @@
 """What the stages before the report leave on disk, made up: real formats, small, a second of work."""
 
 import random
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,11 +30,12 @@ def fake_params(*overrides: str) -> Params:
     return compose("smoke", [here, "kernels=machine", *overrides], conf=ROOT / "conf")
 
 
-def write_run(root: Path, params: Params, *, objects: Sequence[str] = (), skill: float = 0.6) -> Params:
-    """Write params.yaml and data/ of a finished run below `root`; returns the parameters.
+SKILL = 0.6
+"""The share of right answers and classes."""
 
-    `objects` have videos, all of `scenes.objects` by default; `skill` is the share of right answers and classes.
-    """
+
+def write_run(root: Path, params: Params) -> Params:
+    """Write params.yaml and data/ of a finished run below `root`; returns the parameters."""
     rng = random.Random(1)
     catalogue = load_catalogue(Path(params.data.catalogue))
     root.mkdir(parents=True, exist_ok=True)
@@ -46,7 +46,7 @@ def write_run(root: Path, params: Params, *, objects: Sequence[str] = (), skill:
             (root / folder).parent.mkdir(parents=True, exist_ok=True)
             (root / folder).symlink_to(model_folder(Path(folder).name))
     data, parts = root / "data", {o.object_id: o.splits["paper"] for o in catalogue.objects.values()}
-    videos = [_video(o, i, rng) for o in sorted(objects or params.scenes.objects) for i in range(2)]
+    videos = [_video(o, i, rng) for o in sorted(params.scenes.objects) for i in range(2)]
     assignments = [Assignment(video_id=v.video_id, object_id=v.object_id, part=parts[v.object_id]) for v in videos]
     write_table(data / "videos.parquet", Video, videos)
     splits = dict.fromkeys(params.ablation.seeds, assignments)
@@ -68,7 +68,7 @@ def write_run(root: Path, params: Params, *, objects: Sequence[str] = (), skill:
             write_table(folder / INDEX_FILE, Embedding, frames)
             features = np.random.default_rng(seed).normal(size=(len(split), 4)).astype(np.float32)
             save_file({TENSOR: features}, folder / TENSOR_FILE)
-        said = [c for a in split for c in _classify(a, catalogue, skill, rng)]
+        said = [c for a in split for c in _classify(a, catalogue, rng)]
         write_table(data / "encoder" / str(seed) / "classifications.parquet", Classification, said)
         write_table(data / "encoder" / str(seed) / "history.parquet", Measurement, _history("loss", "validation_loss"))
     graded = []
@@ -78,10 +78,10 @@ def write_run(root: Path, params: Params, *, objects: Sequence[str] = (), skill:
         write_table(data / "models" / variant.lora / model / "history.parquet", Measurement, _history("loss"))
         if variant.full:
             examples = build_examples(splits[variant.seed], catalogue, seed=0)
-            told = [p for q in examples if (p := _say(q, variant.opd, skill, rng))]
+            told = [p for q in examples if (p := _say(q, variant.opd, rng))]
             write_jsonl(data / "answers" / variant.key / "examples.jsonl", told)
         for touch in params.ablation.touches(variant):
-            answers = [p for q in questions if (p := _say(q, variant.opd, skill, rng))]
+            answers = [p for q in questions if (p := _say(q, variant.opd, rng))]
             write_jsonl(data / "answers" / variant.key / f"{touch}.jsonl", answers)
             whose = {**variant._asdict(), "seed": replicate, "trained": variant.seed, "touch": touch}
             graded += [Graded(**s.model_dump(), **whose) for s in grade(questions, answers, catalogue)]
@@ -95,23 +95,23 @@ def _video(object_id: str, number: int, rng: random.Random) -> Video:
     return Video(video_id=name, object_id=object_id, path=f"{name}.avi", sha256=f"{rng.getrandbits(256):064x}", **shape)
 
 
-def _classify(a: Assignment, catalogue: Catalogue, skill: float, rng: random.Random) -> list[Classification]:
+def _classify(a: Assignment, catalogue: Catalogue, rng: random.Random) -> list[Classification]:
     if a.part not in (Part.VALIDATION, Part.TEST):
         return []
     said = []
     for p, label in zip(catalogue.properties, catalogue.labels(a.object_id), strict=True):
-        predicted = label if rng.random() < skill else rng.randrange(len(p.levels))
+        predicted = label if rng.random() < SKILL else rng.randrange(len(p.levels))
         probabilities = tuple(1 / len(p.levels) for _ in p.levels) if len(p.levels) != 3 else (0.2, 0.3, 0.5)
         said.append(classified(a.video_id, p.name, label, predicted, probabilities, a.part))
     return said
 
 
-def _say(q: Question, opd: str, skill: float, rng: random.Random) -> Prediction | None:
+def _say(q: Question, opd: str, rng: random.Random) -> Prediction | None:
     """The right answer, or one that cannot be read."""
     dialogue = next((d for d in q.dialogues if d.opd == opd), None)
     if dialogue is None:
         return None
-    right = rng.random() < skill
+    right = rng.random() < SKILL
     outputs = tuple(turn.assistant if right else "I cannot tell." for turn in dialogue.turns)
     return Prediction(question_id=q.question_id, task=q.task, outputs=outputs, truncated=not right, tokens=9)
 

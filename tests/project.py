@@ -38,18 +38,21 @@ REDUCED = (
 )
 
 
+ENVIRONMENT = {
+    **os.environ,
+    "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+    "PYTHONPATH": str(ROOT),
+    "GIT_CONFIG_GLOBAL": os.devnull,
+}
+"""Of what a test starts: this project's commands and code, and nobody's own settings of Git."""
+
+
 class Project:
     """A copy of the project in which commands run as a person would type them."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.environment = {
-            **os.environ,
-            "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
-            "PYTHONPATH": str(folder),
-            "HF_HUB_OFFLINE": "1",
-            "GIT_CONFIG_GLOBAL": os.devnull,
-        }
+        self.environment = {**ENVIRONMENT, "PYTHONPATH": str(folder), "HF_HUB_OFFLINE": "1"}
 
     def run(self, *command: str, status: int = 0) -> str:
         """Run a command; return what it printed."""

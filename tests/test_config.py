@@ -20,7 +20,7 @@ from tests.conftest import CATALOGUE, ROOT, refused
 CONF = ROOT / "conf"
 
 
-@pytest.mark.parametrize("scale", ["smoke", "small", "invented", "paper-7b", "paper-13b", "rehearsal"])
+@pytest.mark.parametrize("scale", scale_names(CONF))
 def test_shipped_scale_is_valid_and_survives_writing(scale: str, tmp_path: Path) -> None:
     params = compose(scale, conf=CONF)
     assert write_params(params, tmp_path / "params.yaml")
@@ -28,43 +28,10 @@ def test_shipped_scale_is_valid_and_survives_writing(scale: str, tmp_path: Path)
     assert not write_params(params, tmp_path / "params.yaml"), "an unchanged file is not written again"
 
 
-def test_a_new_scale_is_a_file(tmp_path: Path) -> None:
-    conf = shutil.copytree(CONF, tmp_path / "conf")
-    (conf / "lab.yaml").write_text("defaults: [small, _self_]\nscale: lab\nlora: {rank: 4}\n")
-    names = "evaluate, finetune, invented, lab, paper-13b, paper-7b, rehearsal, small, smoke"
-    assert ", ".join(scale_names(conf)) == names
-    params = compose("lab", conf=conf)
-    assert (params.scale, params.lora.rank, params.report_name) == ("lab", 4, "lab-scenes")
-    write_params(params, tmp_path / "params.yaml")
-    assert load_params(tmp_path / "params.yaml") == params
-
-
 def test_committed_params_are_written_as_they_are(tmp_path: Path) -> None:
     """Else `octopi scale smoke` would run stages anew whose sections have gained a key."""
     write_params(compose("smoke", conf=CONF), tmp_path / "params.yaml")
     assert (tmp_path / "params.yaml").read_text() == (ROOT / "params.yaml").read_text()
-
-
-# Further ones take the whole way in tests/chain/test_bad_inputs.py.
-@pytest.mark.parametrize(
-    ("overrides", "words"),
-    [
-        (["nothing=1"], "nothing.*allowed here"),
-        (["frames.per_video=0"], "frames.per_video.*greater than or equal to 1"),
-        (["split.fold=1"], "split.fold is not a parameter.*folds"),
-        (["split.name=kfold", "split.folds=3", "ablation.seeds=[0,1,3]"], r"ablation.seeds \[0, 1, 3\].*3 folds"),
-        (["ablation.opd=[none]"], "ablation.opd.*lacks the full system's value all"),
-        (
-            ["lora.skip_contradicted=true", "encoder={embedding:logits,standardize:true}", "questions.two_turns=0.5"],
-            "lora.skip_contradicted.*questions.two_turns=0",
-        ),
-        (["encoder.epochs=true"], "encoder.epochs is True: .*valid integer"),
-        (["encoder.backbone=[timm]", "encoder.recipe=paper"], "encoder.recipe=paper is for CLIP alone"),
-    ],
-)
-def test_wrong_override_is_one_line_with_key_and_mend(overrides: list[str], words: str) -> None:
-    with refused(words):
-        compose("smoke", overrides, conf=CONF)
 
 
 def test_a_broken_params_file_is_written_anew(tmp_path: Path) -> None:
@@ -124,45 +91,45 @@ def test_any_folder_may_hold_the_videos(name: str, tmp_path: Path) -> None:
     assert load_params(tmp_path / "params.yaml").data.dir == str(folder)
 
 
+TRAINED = "baseball,pillow,rug,potato,millet"
+LOGITS = "smoke encoder={embedding:logits,standardize:true} questions.two_turns=0.5 lora.skip_contradicted=true"
+
+
+# Further ones take the whole way in tests/chain/test_bad_inputs.py.
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        ("smoke nothing=1", "nothing.*allowed here"),
+        ("smoke frames.per_video=0", "frames.per_video.*greater than or equal to 1"),
+        ("smoke split.fold=1", "split.fold is not a parameter.*folds"),
+        ("smoke split.name=kfold split.folds=3 ablation.seeds=[0,1,3]", r"ablation.seeds \[0, 1, 3\].*3 folds"),
+        ("smoke ablation.opd=[none]", "ablation.opd.*lacks the full system's value all"),
+        (LOGITS, "lora.skip_contradicted.*questions.two_turns=0"),
+        ("smoke encoder.epochs=true", "encoder.epochs is True: .*valid integer"),
+        ("smoke encoder.backbone=[timm] encoder.recipe=paper", "encoder.recipe=paper is for CLIP alone"),
+        ("smoke frames.pixels=48", "frames.pixels"),
+        ("smoke cross_validation.folds=3", "cross_validation is no section any more; .*split.name=kfold"),
+        ("smoke split.name=development", "split.name=development is split.name=kfold now; allowed: paper"),
         ("small data.source=videos data.dir=nowhere", "data.dir: nowhere does not exist"),
         ("smoke language.weights=nowhere", "hf download lmsys"),
         ("smoke language.start=models/nothing", "language.start: models/nothing holds no trained model"),
         ("smoke scenes.objects=[unicorn]", "scenes.objects: unicorn"),
-        ("smoke frames.pixels=48", "frames.pixels"),
-        ("smoke cross_validation.folds=3", "cross_validation is no section any more; .*split.name=kfold"),
-        ("smoke split.name=development", "split.name=development is split.name=kfold now; allowed: paper"),
-        ("smoke split.test_objects=7", "split.test_objects was of split.name=development; .*split.name=kfold"),
+        (f"smoke scenes.objects=[{TRAINED},bath_towel]", "ablation.touch: swapped .* only bath_towel"),
+        (f"smoke scenes.objects=[{TRAINED},bath_towel] ablation.touch=[removed]", ""),
+        (f"smoke scenes.objects=[{TRAINED},bath_towel,ice_block]", ""),
+        (f"smoke scenes.objects=[{TRAINED}]", ""),
+        ("smoke scenes.objects=[baseball,pillow,millet,bath_towel,ice_block]", "2 training objects"),
+        ("smoke scenes.objects=[bath_towel,ice_block]", "no video of a training object"),
     ],
 )
-def test_missing_inputs_are_named(arguments: str, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_run_is_one_line_with_key_and_mend(
+    arguments: str, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What has no words can."""
     monkeypatch.chdir(ROOT)
     name, *overrides = arguments.split()
-    with refused(words):
-        check_inputs(compose(name, overrides))
-
-
-TRAINED = "baseball,pillow,rug,potato,millet"
-
-
-@pytest.mark.parametrize(
-    ("objects", "override", "words"),
-    [
-        (f"{TRAINED},bath_towel", "seed=0", "ablation.touch: swapped .* only bath_towel"),
-        (f"{TRAINED},bath_towel", "ablation.touch=[removed]", None),
-        (f"{TRAINED},bath_towel,ice_block", "seed=0", None),
-        (TRAINED, "seed=0", None),
-        ("baseball,pillow,millet,bath_towel,ice_block", "seed=0", "2 training objects"),
-        ("bath_towel,ice_block", "seed=0", "no video of a training object"),
-    ],
-)
-def test_too_few_objects(objects: str, override: str, words: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(ROOT)
-    params = compose("smoke", [f"scenes.objects=[{objects}]", override])
     with refused(words) if words else nullcontext():
-        check_inputs(params)
+        check_inputs(compose(name, overrides))
 
 
 @pytest.mark.parametrize("listed", [True, False])
@@ -180,14 +147,6 @@ def test_a_model_that_met_a_test_object(listed: bool, tmp_path: Path, monkeypatc
         check_inputs(first)
     with refused("knows [a-z_]+, which is a test object; name a model that does not"):
         check_inputs(second)
-
-
-def test_variants_are_the_product_of_the_lists() -> None:
-    lists = ["ablation.encoders=[finetuned,base]", "ablation.opd=[all,needed]", "ablation.seeds=[3,5]"]
-    params = compose("smoke", lists, conf=CONF)
-    keys = [v.key for v in params.ablation.variants()]
-    assert len(keys) == len(set(keys)) == 2 * 2 * 2 * 2
-    assert [v.key for v in params.ablation.variants() if v.full] == ["finetuned-with-all-3", "finetuned-with-all-5"]
 
 
 def test_prune_keeps_what_params_name_and_removes_the_rest(tmp_path: Path) -> None:
@@ -208,15 +167,18 @@ def test_prune_keeps_what_params_name_and_removes_the_rest(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("text", "words"),
     [
+        ("defaults: [small, _self_]\nscale: mine\nlora: {rank: 4}\n", ""),
         ("defaults: [small, _self_]\n", "it calls itself small, and would replace its reports; write scale: mine"),
         ("scale: mine\nscale: other\n", "scale mine: "),
     ],
 )
-def test_a_scale_of_ones_own_is_checked(text: str, words: str, tmp_path: Path) -> None:
+def test_a_scale_of_ones_own_is_a_file_which_is_checked(text: str, words: str, tmp_path: Path) -> None:
     conf = Path(shutil.copytree(CONF, tmp_path / "conf"))
     (conf / "mine.yaml").write_text(text)
-    with refused(words):
-        compose("mine", conf=conf)
+    assert {*scale_names(conf)} == {*scale_names(CONF), "mine"}
+    with refused(words) if words else nullcontext():
+        params = compose("mine", conf=conf)
+        assert (params.scale, params.lora.rank, params.report_name) == ("mine", 4, "mine-scenes")
 
 
 def test_a_recipe_brings_its_settings_and_gives_way_to_yours() -> None:

@@ -21,7 +21,9 @@ from pipeline.running.stage import stage
 from pipeline.scales import compose, write_params
 from tests.closure import ROOT
 from tests.conftest import not_utf8, wait_until_ended
+from tests.project import ENVIRONMENT as USUAL
 
+ENVIRONMENT = {**USUAL, "SHELL": "/bin/sh"}
 CHAIN = """\
 stages:
   first: {cmd: touch first.txt, outs: [first.txt]}
@@ -38,10 +40,6 @@ TELLING = (
     f"{WORKERS}for i, _ in enumerate(run_parallel(bytes, [1 << 22] * 9000, '', '')):\n    i or print('now', flush=True)"
 )
 STOPPED = "slow: stopped; finished stages stay, and `octopi repro` goes on from there"
-
-
-ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT), "SHELL": "/bin/sh"}
-ENVIRONMENT["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
 
 
 def launch(folder: Path, *command: str, errors: int, **environment: str) -> subprocess.Popen[str]:

@@ -122,7 +122,6 @@ def test_launchers_are_read() -> None:
     assert launched(named) == (2, True)
     assert launched(f"{named} --num_processes 4") == launched(f"{named} --num-processes=4") == (4, True)
     for wrong, message in (
-        ("accelerate launch --config_file", "expected one argument"),
         ("a --num_processes b", "int"),
         ("accelerate launch --config_file nowhere.yaml", "No such file.*nowhere.yaml"),
         (f"a --config_file {shlex.quote(f'{ROOT}/Makefile')}", "Makefile.*; name a configuration of accelerate's"),
@@ -142,14 +141,11 @@ def test_the_papers_scales_fit_the_cards_they_name() -> None:
         assert max(use.total for use in uses) < 48e9 - GIB
         assert "published" in " ".join(shapes.notes)
         said[scale] = "\n".join(costs(params, shapes))
-    assert "lmsys/vicuna-7b-v1.5, 13 GB" in said["paper-7b"]
-    assert "Host memory" not in said["paper-7b"]
     # 6.738e9 weights of 2 bytes, in pickles and converted, and CLIP's.
     ((total, parts),) = re.findall(r"GB: ([\d.]+) in all \((.*)\)", said["paper-7b"])
     assert f"downloads {1.7 + 4 * 6.738:.0f}" in parts
     assert float(total) == pytest.approx(sum(float(part) for part in re.findall(r" ([\d.]+)", parts)), abs=1)
     assert "Hours: 26, " in said["paper-7b"], "one encoder of 6 and four language models of 5"
-    assert "never been run here" in said["paper-7b"]
     seven = compose("paper-7b")
     assert "Card: 40 GB" in card(seven, [*count(seven, read_shapes(seven))])
     # 13.016e9 weights of 2 bytes, by transformers' own count of this configuration.

@@ -110,9 +110,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
 def project(catalogue: Catalogue, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A project with tiny models, and a video each of balls of twelve sizes."""
     root = tmp_path_factory.mktemp("project")
-    values = yaml.safe_load((ROOT / "params.yaml").read_text())
-    values["data"] |= {"source": "videos", "dir": "films"}
-    (root / "params.yaml").write_text(yaml.safe_dump(values))
+    write_params(compose("smoke", ["data.source=videos", "data.dir=films"], ROOT / "conf"), root / "params.yaml")
     (root / "pipeline").symlink_to(ROOT / "pipeline")
     (root / "films").mkdir()
     sensor = make_sensor(96, 72, 0)
@@ -153,9 +151,7 @@ def trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of a tiny trained model, in a project with videos, which is the working directory."""
     monkeypatch.chdir(tmp_path)
     made = make(tmp_path, Variant(Encoder.FINETUNED, Lora.WITH, Opd.ALL, 0))
-    values = yaml.safe_load((ROOT / "params.yaml").read_text())
-    values["data"] |= {"source": "videos", "dir": "videos"}
-    (tmp_path / "params.yaml").write_text(yaml.safe_dump(values))
+    write_params(compose("smoke", ["data.source=videos", "data.dir=videos"], ROOT / "conf"))
     return made.folder
 
 

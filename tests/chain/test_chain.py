@@ -72,18 +72,6 @@ def test_a_killed_chain_goes_on_and_loses_nothing(project: Project, tmp_path: Pa
             break
 
 
-def test_changed_grader_regenerates_no_answer(project: Project) -> None:
-    grader = project.folder / "pipeline" / "tasks" / "pc.py"
-    text = grader.read_text()
-    grader.write_text(f"{text}\n# changed\n")
-    output = project.run("octopi", "repro", "--dry")
-    grader.write_text(text)
-    assert "stages will run" in output
-    assert "Running stage 'grade'" in output
-    for stage in ("answer", "align", "lora", "embed", "finetune_encoder"):
-        assert f"Running stage '{stage}" not in output
-
-
 def test_the_same_bytes_by_another_processor_s_kernels(project: Project, tmp_path: Path) -> None:
     """A whole second run, report and figures too, on one core, where each library is told to compute otherwise."""
     before = yaml.safe_load((project.folder / "dvc.lock").read_text())["stages"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from collections import Counter
 from pathlib import Path
@@ -23,6 +22,7 @@ from pipeline.videos.records import Assignment
 from tests.closure import ROOT
 from tests.fake_run import fake_params, write_run
 from tests.project import OBJECTS, REDUCED, Project, copy_project
+from tests.report.conftest import rows_of
 from tests.tasks.shared import drafted, grade
 
 PHYSICLEAR = ROOT / "pipeline" / "physiclear"
@@ -55,33 +55,6 @@ def write_catalogue(folder: Path, *, name: str = "stickiness", split: str = "min
         rows.append(f'{object_id},{part},"{known[object_id].name}",{ratings},{number % 4} {number % 4},{number % 3}')
     (folder / "objects.csv").write_text("\n".join(rows))
     return folder
-
-
-def rows(report: Path, table: str) -> list[dict[str, str]]:
-    with (report / f"{table}.csv").open(newline="") as stream:
-        return list(csv.DictReader(stream))
-
-
-def check_report(report: Path, name: str) -> None:
-    """Rows for the fourth property wherever there are rows for properties, and nothing of the paper's."""
-    scores = rows(report, "scores")
-    chances = {row["measure"]: float(row["chance"]) for row in scores if row["task"] in ("OPD", "heads")}
-    expected = dict.fromkeys(("hardness", "roughness", "bumpiness"), 1 / 3) | {name: 1 / 4, "combined": 1 / 108}
-    assert chances == pytest.approx(expected, abs=1e-6)
-    assert {"OPD", "heads"} <= {row["task"] for row in scores if row["measure"] == name}
-    videos = {row["video_id"] for row in rows(report, "confusion") if row["property"] == name}
-    heads = next(row for row in scores if (row["task"], row["measure"]) == ("heads", name))
-    assert len(videos) == float(heads["n"])
-    dataset = rows(report, "dataset")
-    counts = {row["row"]: int(row["objects"]) for row in dataset if row["row"].startswith(f"{name}: ")}
-    assert [*counts.items()] == [(f"{name}: {level}", n) for level, n in zip(LEVELS, (3, 2, 2, 2), strict=True)]
-    together = [row for row in dataset if row["table"] == "property_combinations"]
-    assert sum(int(row["objects"]) for row in together) == len(OBJECTS)
-    assert all(row["row"].endswith(tuple(LEVELS)) for row in together)
-    assert not any(row["published"] for row in dataset)
-    readme = (report / "README.md").read_text()
-    assert "48.10" not in readme, "the paper's figures are about another data set"
-    assert name in readme
 
 
 @pytest.fixture(scope="module")
@@ -139,11 +112,30 @@ def test_the_chain_runs_on_it(project: Project) -> None:
 
 
 def test_the_report_has_its_rows(tmp_path: Path) -> None:
+    """For the fourth property wherever there are rows for properties, and nothing of the paper's."""
     folder = write_catalogue(tmp_path / "catalogue", split="paper")
     params = fake_params(f"data.catalogue='{folder}'", f"scenes.objects=[{','.join(OBJECTS)}]")
     write_run(tmp_path, params)
     write_report(params, tmp_path)
-    check_report(tmp_path / "reports" / params.report_name, "stickiness")
+    report, name = tmp_path / "reports" / params.report_name, "stickiness"
+    scores = rows_of(report / "scores.csv")
+    chances = {row["measure"]: float(row["chance"]) for row in scores if row["task"] in ("OPD", "heads")}
+    expected = dict.fromkeys(("hardness", "roughness", "bumpiness"), 1 / 3) | {name: 1 / 4, "combined": 1 / 108}
+    assert chances == pytest.approx(expected, abs=1e-6)
+    assert {"OPD", "heads"} <= {row["task"] for row in scores if row["measure"] == name}
+    videos = {row["video_id"] for row in rows_of(report / "confusion.csv") if row["property"] == name}
+    heads = next(row for row in scores if (row["task"], row["measure"]) == ("heads", name))
+    assert len(videos) == float(heads["n"])
+    dataset = rows_of(report / "dataset.csv")
+    counts = {row["row"]: int(row["objects"]) for row in dataset if row["row"].startswith(f"{name}: ")}
+    assert [*counts.items()] == [(f"{name}: {level}", n) for level, n in zip(LEVELS, (3, 2, 2, 2), strict=True)]
+    together = [row for row in dataset if row["table"] == "property_combinations"]
+    assert sum(int(row["objects"]) for row in together) == len(OBJECTS)
+    assert all(row["row"].endswith(tuple(LEVELS)) for row in together)
+    assert not any(row["published"] for row in dataset)
+    readme = (report / "README.md").read_text()
+    assert "48.10" not in readme, "the paper's figures are about another data set"
+    assert name in readme
 
 
 def test_the_documented_fourth_property_is_valid(tmp_path: Path) -> None:

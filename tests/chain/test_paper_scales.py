@@ -90,8 +90,18 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     return project
 
 
-def check_trained(project: Project) -> None:
-    """Trained parameters are finite and of the shapes that the published layouts and the scale give."""
+def test_paper_13b_from_videos_to_the_report(project: Project) -> None:
+    """One of three folds."""
+    table = project.run("octopi", "scale", "paper-13b", *FEW, "ablation.seeds=[1]", LAUNCHER)
+    assert "align                   2" in table, "two devices are counted"
+    project.run("octopi", "repro")
+    files = [f for stage in ("align", "lora") for f in project.folder.glob(f"{stage}-?.json")]
+    noted = {f.stem: json.loads(f.read_text()) for f in files}
+    assert noted.keys() == {f"{stage}-{rank}" for stage in ("align", "lora") for rank in (0, 1)}
+    for each in noted.values():
+        assert (each["processes"], each["sharded"], each["computes"]) == (2, True, "torch.float32")
+        assert float(str(each["share"])) < 0.6
+    # Trained parameters are finite and of the shapes that the published layouts and the scale give.
     folder = project.folder / "data" / "models" / "with" / "finetuned-all-1"
     connector = load_file(folder / "connector.safetensors")
     adapter = load_file(folder / "adapter" / "adapter_model.safetensors")
@@ -106,20 +116,6 @@ def check_trained(project: Project) -> None:
     assert {min(value.shape) for value in adapter.values()} == {64}, "rank 128, of a layer that is 64 wide"
     assert {max(value.shape) for value in adapter.values()} == {128}
     assert any(value.any() for name, value in adapter.items() if "lora_B" in name), "it was trained"
-
-
-def test_paper_13b_from_videos_to_the_report(project: Project) -> None:
-    """One of three folds."""
-    table = project.run("octopi", "scale", "paper-13b", *FEW, "ablation.seeds=[1]", LAUNCHER)
-    assert "align                   2" in table, "two devices are counted"
-    project.run("octopi", "repro")
-    files = [f for stage in ("align", "lora") for f in project.folder.glob(f"{stage}-?.json")]
-    noted = {f.stem: json.loads(f.read_text()) for f in files}
-    assert noted.keys() == {f"{stage}-{rank}" for stage in ("align", "lora") for rank in (0, 1)}
-    for each in noted.values():
-        assert (each["processes"], each["sharded"], each["computes"]) == (2, True, "torch.float32")
-        assert float(str(each["share"])) < 0.6
-    check_trained(project)
     for touch in ("real", "removed", "swapped", "noise"):
         said = read_jsonl(project.folder / "data" / "answers" / SYSTEM / f"{touch}.jsonl", Prediction)
         assert Counter(p.task for p in said) == dict.fromkeys(("OPD", "PC", "PSS", "POM", "PSR"), 4)

@@ -45,21 +45,17 @@ def test_right_answers_are_right_and_no_answer_leaves(tmp_path: Path, monkeypatc
     assert (rows["accuracy"] == 1).all()
     assert "| their-model, answered outside this project |" in (report.folder / "README.md").read_text()
 
-    def wrong(*lines: object) -> None:
-        text = "\n".join(line if isinstance(line, str) else json.dumps(line) for line in lines)
-        Path("wrong.jsonl").write_text(text)
-        octopi("questions", "grade", "wrong.jsonl", "--name", "other")
-
-    with refused(rf"{told[-1]['id']} has no answer \(1 question in all"):
-        wrong(*told[:-1])
-    with refused(f"line 2: {told[0]['id']} is answered twice"):
-        wrong(told[0], told[0])
-    with refused("PC-none is none of this run's questions"):
-        wrong(*told, {"id": "PC-none", "text": ""})
-    with refused("line 1: .*write id and text"):
-        wrong("yes")
-    with refused("3 texts for"):
-        wrong({**told[0], "text": ["a", "b", "c"]}, *told[1:])
+    first, *others, last = told
+    for words, lines in (
+        (rf"{last['id']} has no answer \(1 question in all", told[:-1]),
+        (f"line 2: {first['id']} is answered twice", [first, first]),
+        ("PC-none is none of this run's questions", [*told, {"id": "PC-none", "text": ""}]),
+        ("line 1: .*write id and text", ["yes"]),
+        ("3 texts for", [{**first, "text": ["a", "b", "c"]}, *others, last]),
+    ):
+        Path("wrong.jsonl").write_text("\n".join(map(json.dumps, lines)))
+        with refused(words):
+            octopi("questions", "grade", "wrong.jsonl", "--name", "other")
     with refused("--name a/b"):
         octopi("questions", "grade", "told.jsonl", "--name", "a/b")
     with refused("nowhere.jsonl: cannot be read"):

@@ -36,7 +36,8 @@ from pipeline.tracking.live import live
 from pipeline.tracking.publish import publish
 from pipeline.tracking.store import TrackingError, out_of_reach
 from pipeline.training.trainer import TrainableTrainer, Trained, train, training_arguments
-from tests.conftest import HUNG, ROOT, wait_for
+from tests.conftest import HUNG, wait_for
+from tests.project import ENVIRONMENT
 from tests.tracking.conftest import FIRST, FULL, FakeChain, by_name, client, losses, runs
 
 ALIGN = "align@finetuned-all-0"
@@ -178,8 +179,7 @@ def test_mlflow_is_not_imported_without_logging_or_in_a_second_process(chain: Fa
         f"from pipeline.tracking.live import live\nwith live(Stage('{ALIGN}', load_params())) as callbacks: pass\n"
         "assert callbacks == [] and 'mlflow' not in sys.modules"
     )
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "RANK": rank}
-    subprocess.run([sys.executable, "-c", code], check=True, env=environment)
+    subprocess.run([sys.executable, "-c", code], check=True, env={**ENVIRONMENT, "RANK": rank})
     assert not Path("mlruns").exists()
 
 
@@ -257,7 +257,9 @@ def test_a_server_that_dies_meanwhile(chain: FakeChain, tmp_path: Path, caplog: 
     with (tmp_path / "server.log").open("w") as log:
         server = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True, env=environment)
     try:
-        uri = address(tmp_path / "server.log")
+        # At a port that it chose itself, as soon as it says so.
+        wait_for(lambda: " running on http" in (tmp_path / "server.log").read_text())
+        (uri,) = re.findall(r"running on (http://\S+)", (tmp_path / "server.log").read_text())[:1]
         params = watched(chain.params, uri=uri, experiment="remote", timeout_seconds=int(HUNG))
         publish(params)
         assert "nothing new" in publish(params)
@@ -276,9 +278,3 @@ def test_a_server_that_dies_meanwhile(chain: FakeChain, tmp_path: Path, caplog: 
             server.wait()
     assert trained.history == fit(params, []).history
     assert [r.levelname for r in caplog.records].count("WARNING") == 1
-
-
-def address(log: Path) -> str:
-    """Where a server listens, at a port that it chose itself, as soon as it says so."""
-    wait_for(lambda: " running on http" in log.read_text())
-    return re.findall(r"running on (http://\S+)", log.read_text())[0]

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import mlflow
@@ -24,6 +22,7 @@ from pipeline.tracking.store import TrackingError
 from tests.closure import ROOT
 from tests.conftest import refused
 from tests.fake_run import fake_params
+from tests.project import ENVIRONMENT
 from tests.tracking.conftest import (
     BASE,
     CHAIN,
@@ -105,8 +104,6 @@ def test_a_new_task_is_a_column_by_itself(again: FakeChain) -> None:
     found = client().search_runs([experiment.experiment_id], stages["searchFilter"])
     costs = {"system/seconds", "system/peak_memory_mb"}
     assert {run.info.run_name for run in found if costs <= set(run.data.metrics)} == set(TITLES)
-    for table in ("variants", "stages"):
-        assert f"viewStateShareKey={table}" in experiment.tags["mlflow.note.content"]
 
 
 def test_a_run_of_a_fold_has_that_folds_accuracies(chain: FakeChain) -> None:
@@ -146,7 +143,6 @@ def test_only_what_is_new_makes_runs(again: FakeChain, anew: list[str], scores: 
     parent = runs("reproduction")[1]
     children = [run for run in runs() if run.data.tags.get("mlflow.parentRunId") == parent.info.run_id]
     assert {run.info.run_name.removesuffix(PLUMBING) for run in children} == {*anew, variant}
-    assert seconds(parent) == len(anew) * (SECONDS + 1) - 1
     assert parent.data.tags[f"variant.{other}"] == variants[other].info.run_id
     assert f"variant.{variant}" not in parent.data.tags
     assert client().get_run(first.info.run_id).data.tags == first.data.tags
@@ -225,12 +221,11 @@ def test_a_run_belongs_to_what_it_made(tmp_path: Path, monkeypatch: pytest.Monke
     own |= {"outs": ["data/${item.encoder}-${item.seed}"], "metrics": [{"${scale}.json": {"cache": False}}]}
     Path("dvc.yaml").write_text(yaml.safe_dump({"vars": ["params.yaml"], "stages": {"lora": own}}))
     Path("lora.py").write_text(LORA)
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    environment, ran = {**os.environ, "PYTHONPATH": str(ROOT), "PATH": path}, []
+    ran = []
     for rank in (8, 4, 8):
         write_params(params := fake_params(f"lora.rank={rank}"))
         command = "test -d .dvc || dvc init -q --no-scm; dvc repro -q"
-        subprocess.run(command, shell=True, check=True, env=environment)
+        subprocess.run(command, shell=True, check=True, env=ENVIRONMENT)
         ran.append(read_stages(params)["lora@base-0"].ran is not None)
     assert ran == [True, True, False]
 
@@ -277,11 +272,9 @@ def test_an_experiment_publishes_into_the_project(chain: FakeChain) -> None:
     Path("stages").mkdir()
     Path("stages/publish.py").write_text(PUBLISH)
     Path("dvc.yaml").write_text(CHAIN.replace("publish: {cmd: x}", "publish: {cmd: python stages/publish.py}"))
-    environment = {**os.environ, "GIT_CONFIG_GLOBAL": os.devnull, "PYTHONPATH": str(ROOT)}
-    environment["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
 
     def run(command: str) -> str:
-        return subprocess.run(command, shell=True, env=environment, text=True, capture_output=True, check=True).stdout
+        return subprocess.run(command, shell=True, env=ENVIRONMENT, text=True, capture_output=True, check=True).stdout
 
     run("git init -q && git config user.name a && git config user.email a@b && dvc init -q")
     run("git add . && git commit -qm a && dvc exp run --temp --single-item publish")

@@ -106,7 +106,7 @@ def tab(folder: Path, width: int = 1280, height: int = 900) -> Iterator[Tab]:
             browser.events, browser._socket, browser._ids = [], socket, itertools.count()
             (target,) = [t for t in browser.call("Target.getTargets")["targetInfos"] if t["type"] == "page"]
         page = f"ws://127.0.0.1:{port}/devtools/page/{target['targetId']}"
-        with connect(page, max_size=None) as socket:
+        with connect(page, max_size=None, ping_interval=None) as socket:  # A busy browser answers late.
             yield Tab(socket)
     finally:
         process.terminate()

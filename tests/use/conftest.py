@@ -6,7 +6,7 @@ import pytest
 
 from pipeline.core.records import Encoder, Lora, Opd, Variant
 from pipeline.use.model import Octopi
-from tests.use.shared import Made, make
+from tests.use.shared import Made, configured, make
 
 
 @pytest.fixture(scope="session")
@@ -20,9 +20,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
 @pytest.fixture(scope="session")
 def octopi(made: Made) -> Octopi:
     """As one whose videos, which are files here, are a real sensor's."""
-    model = Octopi.from_pretrained(made.folder, device="cpu")
-    config = model.config.model_copy(update={"trained_on": "videos"})
-    return Octopi(made.folder, config, model.catalogue, model.llm, model.encoder.device)
+    return configured(Octopi.from_pretrained(made.folder, device="cpu"), made, trained_on="videos")
 
 
 @pytest.fixture

@@ -3,6 +3,9 @@
 import hashlib
 import itertools
 import json
+import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -18,7 +21,8 @@ from pipeline.use.frames import read_touch
 from pipeline.use.model import with_marks
 from pipeline.use.results import Description, Touch, Video
 from pipeline.use.server import listen, make_server
-from tests.conftest import HUNG
+from tests.conftest import HUNG, ROOT
+from tests.project import ENVIRONMENT
 from tests.use.videos import uri
 
 CHAT = "/v1/chat/completions"
@@ -104,6 +108,24 @@ def running(app: Any) -> Iterator[int]:
             there.should_exit = True
             thread.join(HUNG)
             assert not thread.is_alive()
+
+
+class Running:
+    """A command that serves until it is ended, as a user starts it: its process, address and what else it says."""
+
+    def __init__(self, *words: object, folder: Path = ROOT) -> None:
+        command = [Path(sys.executable).with_name("octopi"), *words, "--device", "cpu", "--port", "0"]
+        self.process = subprocess.Popen(
+            [*map(str, command)], cwd=folder, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True,
+            # What a shell starts in the background ignores it, and so would what is started here.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )  # fmt: skip
+        assert self.process.stdout is not None
+        self.address, _, self.rest = self.process.stdout.readline().partition(" ")
+
+    def end(self) -> None:
+        self.process.kill()
+        self.process.wait(HUNG)
 
 
 def part(data: bytes, kind: str = "video_url") -> dict[str, Any]:

@@ -136,6 +136,12 @@ def make(where: Path, variant: Variant, *overrides: str) -> Made:
     return Made(out, videos, questions, predictions, classified, params, variant)
 
 
+def configured(model: Octopi, made: Made, **changes: object) -> Octopi:
+    """The same weights under another configuration."""
+    config = model.config.model_copy(update=changes)
+    return Octopi(made.folder, config, model.catalogue, model.llm, model.encoder.device)
+
+
 def replay(
     model: Octopi, questions: Sequence[Question], predictions: Sequence[Prediction], opd: Opd, files: Mapping[str, Path]
 ) -> int:

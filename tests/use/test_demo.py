@@ -15,9 +15,7 @@ import pytest
 
 from pipeline.core.records import GAIN, MIDDLE
 from pipeline.scenes.recipe import load_recipes
-from pipeline.use.demo import ASIDE, GLOW, MOST_TOUCHES, Asked, Session, Turn, make_app, where
-from pipeline.use.model import Octopi
-from pipeline.use.results import Exchange
+from pipeline.use.demo import ASIDE, GLOW, MOST_TOUCHES, Asked, Session, make_app, where
 from pipeline.use.server import Failed
 from pipeline.videos.catalogue import Catalogue
 from tests.conftest import HUNG, PHYSICLEAR, refused
@@ -156,20 +154,6 @@ def test_old_touches_are_forgotten(tmp_path: Path, catalogue: Catalogue) -> None
     assert all(video.exists() for video in videos), "a file that the page was not given is not its own"
     session.show("rug", videos[0])
     assert [video.exists() for video in dropped] == [False] + [True] * (MOST_TOUCHES - 1)
-    session.close()
-
-
-def test_a_trained_model_is_shown_and_asked(octopi: Octopi, files: list[Path], catalogue: Catalogue) -> None:
-    session = Session(octopi, catalogue, {})
-    shown = asyncio.run(session.work(lambda: session.show("ice block", files[0])))
-    described = octopi.describe(files[0])
-    assert (shown["levels"], shown["probabilities"]) == (described.levels, described.probabilities)
-    assert len(shown["frames"]) == len(shown["touched"]) == len(described.frames)
-    first = said(session, question="Soft? {tactile}", touches=[shown["id"]])
-    assert first == octopi.ask("Soft? {tactile}", files[:1])
-    turn = Turn(question="Soft? {tactile}", touches=[shown["id"]], answer=first)
-    again = said(session, question="Why?", history=[turn])
-    assert again == octopi.ask("Why?", history=[Exchange("Soft? {tactile}", tuple(files[:1]), first)])
     session.close()
 
 

@@ -3,7 +3,7 @@
 import re
 import runpy
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from hashlib import sha256
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,12 +27,12 @@ from pipeline.report.load import load_report, published
 from pipeline.report.tables import measured
 from pipeline.running.errors import UserError
 from pipeline.scales import compose, write_params
-from pipeline.tasks.base import find_level
 from pipeline.use import folder
 from pipeline.use.adapt import adapt
 from pipeline.use.evaluate import after_ratings, answers_about, answers_after_ratings, check_rated
 from pipeline.use.folder import Base, find_base, read_folder
 from pipeline.use.model import REAL, Octopi, on_real_videos
+from pipeline.use.results import Description
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.records import Assignment, Video
 from tests.checkpoints import model_folder
@@ -97,8 +97,8 @@ def test_the_readmes_table_is_that_of_the_report() -> None:
         assert task not in row[0], "in words"
 
 
-def curve() -> list[str]:
-    """Lines of a table: by how many objects were rated, what the language model and heads had right of others."""
+def test_the_learning_curve_of_the_documents_is_that_of_the_report() -> None:
+    """By how many objects were rated, what the language model and heads had right of others."""
     found = load_report(ROOT / "reports" / "evaluate-videos").scores.query(f"seed == {ALL_SEEDS!r}")
     found = found[found["measure"].isin(["choice", "combined"])].set_index(["encoder", "touch", "task"])
     lines = []
@@ -110,12 +110,8 @@ def curve() -> list[str]:
             said = measured(model) if task == "OPD" else f"{100 * model['accuracy']:.1f}"
             cells.append(f"{said} / {100 * rules['accuracy']:.1f}")
         lines.append(f"| {count or 'none'} | {' | '.join(cells)} |")
-    return lines
-
-
-def test_the_learning_curve_of_the_documents_is_that_of_the_report() -> None:
     document = (ROOT / "docs" / "data.md").read_text(encoding="utf-8")
-    assert "\n".join(curve()) in document
+    assert "\n".join(lines) in document
     trained = load_report(ROOT / "reports" / "small-videos").scores.query(f"seed == {ALL_SEEDS!r} and task == 'OPD'")
     full = trained.query("measure == 'combined' and encoder == 'finetuned' and lora == 'with' and touch == 'real'")
     (best,) = full[full["opd"] == "all"]["accuracy"]
@@ -170,6 +166,15 @@ def test_it_tells_touches_apart_from_any_folder(
     assert "b) is a tile" in matched.answer
 
 
+def as_described(graded: Sequence[GradedVision], said: Mapping[str, Description]) -> None:
+    """What was graded of the hardness of each object is what is said of its video."""
+    for row in graded:
+        if row.measure == "hardness" and row.shown is Shown.CLASSES:
+            assert row.predicted == said[row.objects[0]].levels["hardness"]
+        elif row.measure == "hardness" and row.shown is Shown.TOUCH:
+            assert f" {row.predicted} " in said[row.objects[0]].sentence
+
+
 @pytest.mark.slow
 def test_a_runs_videos_are_asked_about_twice(octopi: Octopi, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What it says of them is what it says to a person who asks; an object that it was trained on stops the stage."""
@@ -190,8 +195,7 @@ def test_a_runs_videos_are_asked_about_twice(octopi: Octopi, tmp_path: Path, mon
         runpy.run_path(str(ROOT / "stages" / "evaluate.py"), run_name="__main__")
         return read_table(tmp_path / "data" / "evaluated.parquet", GradedVision)
 
-    objects = {"pillow": "soft", "baseball": "hard", "steel_wool": "rough"}
-    graded = run(objects)
+    graded = run(objects := {"pillow": "soft", "baseball": "hard", "steel_wool": "rough"})
     ways = {way: [(r.question_id, r.measure) for r in graded if r.shown is way] for way in Shown}
     assert ways[Shown.TOUCH] == ways[Shown.STANDARDISED] == ways[Shown.CLASSES]
     sets = [{r.question_id for r in graded if r.seed == seed} for seed in (0, 1)]
@@ -200,12 +204,7 @@ def test_a_runs_videos_are_asked_about_twice(octopi: Octopi, tmp_path: Path, mon
     assert Counter(asked.values()) == {"OPD": 2, "PC": 1, "POM": 1}, "half of them describe"
     assert all(r.parsed for r in graded if r.task == "POM"), "it is asked under names as in training"
     said = dict(zip(objects, octopi.describe_all([EXAMPLES / f"{v}.mp4" for v in objects.values()]), strict=True))
-    for row in graded:
-        if row.measure == "hardness" and row.shown is Shown.CLASSES:
-            assert row.predicted == said[row.objects[0]].levels["hardness"]
-        elif row.measure == "hardness" and row.shown is Shown.TOUCH:
-            assert find_level(said[row.objects[0]].sentence, octopi.catalogue.properties[0]) is not None
-            assert f" {row.predicted} " in said[row.objects[0]].sentence
+    as_described(graded, said)
     with pytest.raises(SystemExit, match=r"evaluate.models: octopi-small was trained on object_\S+, which"):
         run({next(iter(octopi.catalogue.objects)): "soft"})
 
@@ -231,12 +230,7 @@ def test_after_ratings_it_answers_as_its_copy(octopi: Octopi, tmp_path: Path, mo
         to = tmp_path / str(count)
         adapt(octopi, own, to, catalogue=ratings, objects=[*parts])
         copy = Octopi.from_pretrained(to, dtype="float32")
-        for row in graded:
-            said = copy.describe(EXAMPLES / f"{files[row.objects[0]]}.mp4")
-            if row.measure == "hardness" and row.shown is Shown.CLASSES:
-                assert row.predicted == said.levels["hardness"]
-            elif row.measure == "hardness":
-                assert f" {row.predicted} " in said.sentence
+        as_described(graded, {name: copy.describe(EXAMPLES / f"{video}.mp4") for name, video in files.items()})
     check_rated([], {0: split})
     check_rated([0, 2], {0: split})
     with pytest.raises(UserError, match=r"evaluate.rated: 3 objects, but seed 1 trains on 2"):

@@ -21,17 +21,14 @@ from tests.use.shared import Made
 EXAMPLES = ROOT / "examples"
 
 
-def commands(readme: Path) -> list[list[str]]:
-    blocks = re.findall(r"```sh\n(.*?)```", readme.read_text(encoding="utf-8"), re.DOTALL)
-    return [shlex.split(line) for block in blocks for line in block.splitlines()]
-
-
 def test_the_walk_of_a_new_sensor(tmp_path: Path) -> None:
     """As typed from its README, to the questions; from there on tests/chain walks."""
     project = copy_project(tmp_path / "project")
     (project.folder / "examples").mkdir()
     (project.folder / "examples" / "new_sensor").symlink_to(EXAMPLES / "new_sensor")
-    typed = commands(EXAMPLES / "new_sensor" / "README.md")
+    readme = (EXAMPLES / "new_sensor" / "README.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```sh\n(.*?)```", readme, re.DOTALL)
+    typed = [shlex.split(line) for block in blocks for line in block.splitlines()]
     last = typed.index(["octopi", "repro"])
     assert [words[:2] for words in typed[last + 1 :]] == [["octopi", "describe"], ["octopi", "demo"]]
     for command in typed[:last]:

@@ -3,6 +3,7 @@
 import json
 import runpy
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,13 @@ import yaml
 
 from pipeline.core.records import Part
 from pipeline.evaluation.grading import grade
+from pipeline.scales import write_params
 from pipeline.tasks import TASKS
-from pipeline.use.folder import FORMAT, OTHER_BASE, Base, ModelConfig, read_folder
+from pipeline.use.folder import CONFIG, FORMAT, OTHER_BASE, Base, ModelConfig, read_folder
 from pipeline.use.model import Octopi
 from pipeline.use.package import export, package
 from pipeline.videos.catalogue import load_catalogue
-from tests.checkpoints import contents, edit, write_llama
+from tests.checkpoints import contents, cut, edit, write_llama
 from tests.conftest import ROOT, octopi, refused
 from tests.fake_run import fake_params
 from tests.use.shared import PARTS, Made
@@ -69,9 +71,8 @@ def test_the_stage_packages_what_is_asked_for(made: Made, tmp_path: Path, monkey
     monkeypatch.chdir(tmp_path)
     for overrides, made_too in (([], []), (["packaged=all"], ["finetuned-with-none-0"])):
         lists = ["ablation.encoders=[finetuned]", "ablation.lora=[with]", "ablation.opd=[none,all]"]
-        values = fake_params(*lists, *overrides).model_dump(mode="json")
-        values |= {name: made.params.model_dump(mode="json")[name] for name in ("frames", "encoder", "language")}
-        (tmp_path / "params.yaml").write_text(yaml.safe_dump(values))
+        own = {name: getattr(made.params, name) for name in ("frames", "encoder", "language")}
+        write_params(fake_params(*lists, *overrides).model_copy(update=own))
         runpy.run_path(str(ROOT / "stages" / "package.py"), run_name="__main__")
         assert sorted(f.name for f in (tmp_path / "models").iterdir()) == sorted([made.variant.key, *made_too])
 
@@ -116,32 +117,28 @@ def test_a_base_by_name_and_one_in_a_known_place(copy: Path, llama: Path, tmp_pa
         Octopi.from_pretrained(copy, base=other)
 
 
-def test_frames_of_another_setting_are_refused(copy: Path, llama: Path) -> None:
-    frames = json.loads((copy / "config.json").read_text())["frames"]
-    edit(copy / "config.json", frames={**frames, "per_video": 4})
-    with refused("frame settings are not those of training"):
+READ = ("encoder/encoder.safetensors", "language/connector.safetensors", "catalogue.json")
+
+
+def other_frames(folder: Path) -> None:
+    edit(folder / CONFIG, frames=json.loads((folder / CONFIG).read_text())["frames"] | {"per_video": 4})
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda f: (f / CONFIG).unlink(), "holds no config.json"),
+        (lambda f: (f / CONFIG).write_text("{"), "not JSON"),
+        (lambda f: (f / CONFIG).write_text('{"format": 0}'), f"of format 0, .* {FORMAT}"),
+        (lambda f: (f / CONFIG).write_text(f'{{"format": {FORMAT}}}'), "Field required"),
+        (other_frames, "frame settings are not those of training"),
+        (lambda f: (f / "catalogue.json").unlink(), "catalogue.json: is missing"),
+        *((lambda f, name=name: cut(f / name), f"{name}: differs") for name in READ),
+    ],
+)
+def test_what_is_no_model_or_a_changed_one_is_refused(
+    spoil: Callable[[Path], object], words: str, copy: Path, llama: Path
+) -> None:
+    spoil(copy)
+    with refused(words):
         Octopi.from_pretrained(copy, base=llama)
-
-
-@pytest.mark.parametrize("name", ["encoder/encoder.safetensors", "language/connector.safetensors", "catalogue.json"])
-def test_a_changed_or_missing_file_is_named(name: str, copy: Path) -> None:
-    with (copy / name).open("ab") as stream:
-        stream.write(b" ")
-    with refused(f"{name}: differs"):
-        read_folder(copy)
-    (copy / name).unlink()
-    with refused(f"{name}: is missing"):
-        read_folder(copy)
-
-
-def test_what_is_no_model_is_refused(tmp_path: Path) -> None:
-    with refused("holds no config.json"):
-        Octopi.from_pretrained(tmp_path)
-    for text, message in (
-        ("{", "not JSON"),
-        ('{"format": 0}', f"of format 0, .* {FORMAT}"),
-        (f'{{"format": {FORMAT}}}', "Field required"),
-    ):
-        (tmp_path / "config.json").write_text(text)
-        with refused(message):
-            Octopi.from_pretrained(tmp_path)

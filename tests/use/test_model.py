@@ -1,6 +1,7 @@
 """A packaged model answers as the evaluation did, remembers touches, and refuses what it cannot answer in one line."""
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -20,7 +21,7 @@ from pipeline.use.memory import TOUCHES
 from pipeline.use.model import Octopi
 from tests.conftest import moving_square, refused, write_video
 from tests.frame_rules import decode
-from tests.use.shared import PARTS, Made, make, replay
+from tests.use.shared import PARTS, Made, configured, make, replay
 
 TUNED = ("encoder.recipe=tuned", "encoder.reference=subtract", "encoder.standardize=false")
 
@@ -153,7 +154,6 @@ def test_typed_tasks(octopi: Octopi, files: list[Path], monkeypatch: pytest.Monk
     assert (model_code.APART in ranked.notes) == (ranked.order[-1] != 1)
     assert sorted(ranked.order) == [0, 1, 2]
     assert [ranked.expected[i] for i in ranked.order] == sorted(ranked.expected)
-    assert octopi.rank(files[:2], "hardness").most == 1
     said["Is the object"] = "Conclusion: Yes, the first object is softer."
     softer = octopi.compare(files[0], files[1], "softer")
     assert (softer.choice, "softer than" in softer.question) == ("yes", True)
@@ -213,11 +213,7 @@ def test_what_the_heads_say_stands_beside_an_answer(
 
 
 def test_a_model_of_synthetic_touches_says_so_on_every_answer(octopi: Octopi, made: Made, files: list[Path]) -> None:
-    def of(source: str) -> Octopi:
-        config = octopi.config.model_copy(update={"trained_on": source})
-        return Octopi(made.folder, config, octopi.catalogue, octopi.llm, octopi.encoder.device)
-
-    synthetic = of("scenes")
+    synthetic = configured(octopi, made, trained_on="scenes")
     (note,) = synthetic.doubts
     assert "synthetic touches alone" in note
     assert "was not measured" in note, "its card has no figures of real videos"
@@ -226,22 +222,32 @@ def test_a_model_of_synthetic_touches_says_so_on_every_answer(octopi: Octopi, ma
     shown = synthetic.verdict("How is it?", files[0])
     assert shown
     assert re.fullmatch(r"[^%]*score 0\.\d\d[^%]*", shown.shown)
-    assert of("videos").doubts == ()
+
+
+BUMPY = {"a mug": ("hard", "smooth", "bumpy"), "a rug": ("soft", "rough", "no bumps")}
 
 
 @pytest.mark.parametrize(
-    ("question", "count", "words"),
+    ("ask", "words"),
     [
-        ("{tactile} is it softer?", 2, r"1 \{tactile\} for 2 videos"),
-        ("Is it \udcff?", 0, "is no text in UTF-8"),
-        ("Is <tact_frame> soft?", 0, "<tact_frame>, which stands for a touch"),
-        ("long " * 1000, 1, "begin a new conversation"),
+        (lambda model, files: model.ask("{tactile} is it softer?", files[:2]), r"1 \{tactile\} for 2 videos"),
+        # Of a stream before the first piece is asked for.
+        (lambda model, _: model.stream("Is it \udcff?"), "is no text in UTF-8"),
+        (lambda model, _: model.ask("Is <tact_frame> soft?"), "<tact_frame>, which stands for a touch"),
+        (lambda model, files: model.stream("long " * 1000, files[:1]), "begin a new conversation"),
+        (lambda model, files: model.compare(*files[:2], "hardnes"), r"hardnes: .*did you mean hardness\? it knows"),
+        (
+            lambda model, files: model.match(files, ["rug", "millet", "a yo-yo"]),
+            "a yo-yo: .*no such object; .*: soft",
+        ),
+        (lambda model, files: model.match(files[:2], BUMPY), r"NAME: soft\|moderately hard\|hard, .*no bumps"),
     ],
 )
-def test_questions_that_do_not_fit(question: str, count: int, words: str, octopi: Octopi, files: list[Path]) -> None:
-    for ask in (octopi.ask, octopi.stream):  # Of a stream before the first piece is asked for.
-        with refused(words):
-            ask(question, files[:count])
+def test_what_does_not_fit_or_is_not_known_is_refused(
+    ask: Callable[[Octopi, list[Path]], object], words: str, octopi: Octopi, files: list[Path]
+) -> None:
+    with refused(words):
+        ask(octopi, files)
 
 
 def test_videos_that_cannot_be_used_are_refused(octopi: Octopi, tmp_path: Path) -> None:
@@ -262,15 +268,6 @@ def test_videos_that_cannot_be_used_are_refused(octopi: Octopi, tmp_path: Path) 
     assert any("nothing touches the sensor" in note for note in octopi.describe(still).notes)
 
 
-def test_unknown_words_are_refused(octopi: Octopi, files: list[Path]) -> None:
-    with refused(r"hardnes: no property of this model; did you mean hardness\? it knows"):
-        octopi.compare(files[0], files[1], "hardnes")
-    with refused("a unicorn: .*catalogue has no such object; .*a unicorn: soft"):
-        octopi.match(files, ["rug", "millet", "a unicorn"])
-    with refused(r"NAME: soft\|moderately hard\|hard, .*no bumps"):
-        octopi.match(files[:2], {"a mug": ("hard", "smooth", "bumpy"), "a rug": ("soft", "rough", "no bumps")})
-
-
 def test_a_weak_and_a_damaged_video_are_noted(made: Made, octopi: Octopi, files: list[Path], tmp_path: Path) -> None:
     whole = files[0].read_bytes()
     (cut := tmp_path / "cut.avi").write_bytes(whole[: 2 * len(whole) // 3])
@@ -286,9 +283,7 @@ def test_a_weak_and_a_damaged_video_are_noted(made: Made, octopi: Octopi, files:
 
 def test_a_model_on_random_weights_says_so(octopi: Octopi, made: Made, files: list[Path]) -> None:
     assert octopi.notes(files[:2]) == octopi.doubts == ()
-    base = octopi.config.base.model_copy(update={"folder": "data/weights/tiny-llama"})
-    config = octopi.config.model_copy(update={"base": base})
-    random = Octopi(made.folder, config, octopi.catalogue, octopi.llm, octopi.encoder.device)
+    random = configured(octopi, made, base=octopi.config.base.model_copy(update={"folder": "data/weights/tiny-llama"}))
     assert random.notes(files[:1]) == random.describe(files[0]).notes == random.doubts
     assert "tiny and random" in random.doubts[0]
     assert repr(random).startswith("Octopi(finetuned-with-all-0, base data/weights/tiny-llama, trained on ")

@@ -117,7 +117,6 @@ def test_without_files_the_last_pictures_of_the_sensor_are_asked_about(node: Any
 
 
 def test_what_goes_wrong_is_one_line_of_the_server(node: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (notes := tmp_path / "notes.mp4").write_text("no video")
     video = press(tmp_path / "a.mp4")
     for asked, told, answer in (
         (goal("{tactile} {tactile}?", video), "2 {tactile} for 1 video;", ""),
@@ -129,6 +128,6 @@ def test_what_goes_wrong_is_one_line_of_the_server(node: Any, tmp_path: Path, mo
         assert told in result.error
         assert "\n" not in result.error
     monkeypatch.setenv("OCTOPI_TOKEN", "another")
-    assert "token" in node.execute(goal("Soft?", notes)).error
+    assert "token" in node.execute(goal("Soft?", video)).error
     node.url = "http://127.0.0.1:9"  # Where nothing listens.
-    assert "is `octopi serve` running?" in node.execute(goal("Soft?", notes)).error
+    assert "is `octopi serve` running?" in node.execute(goal("Soft?", video)).error

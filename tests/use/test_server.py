@@ -1,7 +1,6 @@
 """`octopi serve` on a real socket: many clients, slow ones, rude ones, and its end; and the demo's command."""
 
 import json
-import os
 import signal
 import socket
 import subprocess
@@ -10,7 +9,6 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import httpx2
@@ -20,7 +18,8 @@ import pytest
 from pipeline.use.serve import make_app
 from pipeline.videos.catalogue import load_catalogue
 from tests.conftest import HUNG, ROOT, wait_for, wait_until_ended
-from tests.use.fake import CHAT, FakeOctopi, body, digest, events, part, running, said, text, user
+from tests.project import ENVIRONMENT
+from tests.use.fake import CHAT, FakeOctopi, Running, body, digest, events, part, running, said, text, user
 from tests.use.shared import Made
 from tests.use.videos import video
 
@@ -111,9 +110,8 @@ with listen("127.0.0.1", 0) as listening:
 @contextmanager
 def started() -> Iterator[tuple[Any, str]]:
     """A server in a process of its own, and its address. It answers after a line on its standard input."""
-    env = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", SCRIPT]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=env)
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=ENVIRONMENT)
     try:
         yield process, f"http://127.0.0.1:{int(process.stdout.readline())}"
     finally:
@@ -151,23 +149,12 @@ def test_no_checking_process_outlives_a_killed_server() -> None:
 
 def test_the_demo_is_shown_until_it_is_interrupted(made: Made) -> None:
     catalogue = ROOT / "pipeline" / "physiclear"
-    command = [Path(sys.executable).with_name("octopi"), "demo", made.folder, "--catalogue", catalogue]
-    process = subprocess.Popen(
-        [*command, "--device", "cpu", "--port", "0"],
-        cwd=made.folder.parents[1],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        stdout=subprocess.PIPE,
-        text=True,
-        # What a shell starts in the background ignores it, and so would what is started here.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
+    demo = Running("demo", made.folder, "--catalogue", catalogue, folder=made.folder.parents[1])
     try:
-        assert process.stdout is not None
-        address, _, rest = process.stdout.readline().partition(" ")
-        assert rest == "shows the demo; Ctrl-C ends it\n"
-        about = httpx2.get(f"{address}/api/about", timeout=HUNG).json()
+        assert demo.rest == "shows the demo; Ctrl-C ends it\n"
+        about = httpx2.get(f"{demo.address}/api/about", timeout=HUNG).json()
         assert about["model"] == "finetuned-with-all-0"
         assert len(about["scenes"]) == len(load_catalogue(catalogue).objects)
     finally:
-        process.send_signal(signal.SIGINT)
-    assert process.wait(HUNG) == 0
+        demo.process.send_signal(signal.SIGINT)
+    assert demo.process.wait(HUNG) == 0

@@ -1,7 +1,5 @@
 """The studio: a camera that is odd in every way, and the whole page in a real browser, killed in the middle."""
 
-import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,11 +16,13 @@ from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.film import write_film
 from pipeline.videos.importing.presses import Shot
 from tests.checkpoints import model_folder
-from tests.conftest import HUNG, ROOT, wait_for
+from tests.conftest import wait_for
 from tests.use.browser import Tab, tab
+from tests.use.fake import Running
 from tests.use.test_live import Camera
 from tests.use.videos import recording
 
+pytestmark = pytest.mark.slow
 CLASSES = {"foam": (0, 1, 0), "brick": (2, 2, 0), "toy_brick": (2, 0, 2)}
 
 
@@ -55,21 +55,6 @@ def test_what_is_odd_about_camera_gel_and_press_is_said(monkeypatch: pytest.Monk
     assert len({shot.stamped for shot in told[0][1]}) == len(told[0][1]), "each picture has its time"
 
 
-class Running:
-    """`octopi studio` as a user starts it."""
-
-    def __init__(self, folder: Path, camera: Path) -> None:
-        options = ["--camera", camera, "--base", model_folder("smollm2"), "--device", "cpu"]
-        command = [Path(sys.executable).with_name("octopi"), "studio", folder, *options, "--port", "0"]
-        self.process = subprocess.Popen([*map(str, command)], cwd=ROOT, stdout=subprocess.PIPE, text=True)
-        assert self.process.stdout is not None
-        self.address = self.process.stdout.readline().split()[0]
-
-    def end(self) -> None:
-        self.process.kill()
-        self.process.wait(HUNG)
-
-
 def submit(page: Tab, field: str, text: str) -> None:
     page.run(f"(f => {{ f.value = {text!r}; f.dispatchEvent(new Event('change')); f.form.requestSubmit() }})({field})")
 
@@ -86,7 +71,8 @@ def rate(page: Tab, rater: str, classes: Sequence[int]) -> None:
 def test_record_rate_adapt_and_ask_in_a_browser(tmp_path: Path) -> None:
     write_film(camera := tmp_path / "camera.mp4", recording([range(40, 60)], 75, height=96, width=128), 25.0)
     lab, (first, *others) = tmp_path / "lab", CLASSES
-    run = Running(lab, camera)
+    command = ("studio", lab, "--camera", camera, "--base", model_folder("smollm2"))
+    run = Running(*command)
     try:
         with tab(tmp_path, 1440) as page:
             page.call("Page.navigate", url=run.address)
@@ -98,7 +84,7 @@ def test_record_rate_adapt_and_ask_in_a_browser(tmp_path: Path) -> None:
             page.until("document.querySelector('#curve.pressed')")
             run.end()  # In the middle of a press: what was recorded before is there.
             page.until("document.querySelector('#gone').textContent.includes('does not answer')")
-            run = Running(lab, camera)
+            run = Running(*command)
             page.call("Page.navigate", url=run.address)
             page.until("document.querySelectorAll('.chip').length === 1")
             for number, name in enumerate(others, 2):

@@ -27,7 +27,6 @@ from tests.encoders import config, write_timm
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
 ONE = "model.safetensors"
-INDEX = "model.safetensors.index.json"
 CLIP_FORM = "open_clip_config.json"
 WRITE: dict[str, Callable[[Path], Path]] = {
     "llama": write_llama,
@@ -35,11 +34,6 @@ WRITE: dict[str, Callable[[Path], Path]] = {
     "clip": write_clip,
     "timm": write_timm,
 }
-Damage = tuple[Callable[[Path], object], str]
-
-
-def without(file: Path, name: str) -> None:
-    save_file({other: value for other, value in load_file(file).items() if other != name}, file)
 
 
 def other_vocabulary(folder: Path) -> None:
@@ -56,26 +50,52 @@ def form_of_clip(folder: Path, part: str, **changes: Any) -> None:
 
 
 vision = partial(form_of_clip, part="vision_cfg")
-LLAMA: list[Damage] = [
-    (lambda f: (f / "tokenizer.json").write_text(""), "tokenizer.json is no fast tokenizer"),
-    (lambda f: edit(f / "config.json", hidden_size=None), r"weight is \[260, 32\], not \[260, 40"),
-    (lambda f: cut(f / ONE), "model.safetensors is cut off or not a safetensors file .*; download it"),
-    (lambda f: (f / ONE).rename(f / "pytorch_model.bin"), "only pickles"),
-    (lambda f: without(f / ONE, "lm_head.weight"), "lm_head.weight is missing"),
-    (other_vocabulary, "tokenizer.json has words up to number 259, but vocab_size of .*/config.json is 259"),
+
+
+def spoil(folder: Path, file: str, name: str) -> None:
+    value = load_file(folder / file)[name]
+    value.view(-1)[-3] = torch.nan
+    replace(folder / file, name, value)
+
+
+def check(folder: Path) -> None:
+    """What `octopi scale` asks of a folder."""
+    if folder.name in ("clip", "timm"):
+        check_encoder(folder, 32, (folder.name,))
+        check_encoder_files(folder, (folder.name,))
+    else:
+        check_language(folder)
+        check_language_files(folder)
+
+
+def load(folder: Path) -> None:
+    if folder.name == "llama":
+        load_llm(folder, torch.float32)
+    else:
+        base_encoder(config(folder, "tuned", backbone=(folder.name,)))
+
+
+Row = tuple[str, Callable[[Path], object], str]
+BROKEN: list[Row] = [
+    ("llama", lambda f: (f / "tokenizer.json").write_text(""), "tokenizer.json is no fast tokenizer"),
+    ("llama", lambda f: edit(f / "config.json", hidden_size=None), r"weight is \[260, 32\], not \[260, 40"),
+    ("llama", lambda f: cut(f / ONE), "model.safetensors is cut off or not a safetensors file .*; download it"),
+    ("llama", lambda f: (f / ONE).rename(f / "pytorch_model.bin"), "only pickles"),
+    ("llama", lambda f: save_file({"x": torch.zeros(1)}, f / ONE), "lm_head.weight is missing"),
+    ("llama", other_vocabulary, "tokenizer.json has words up to number 259, but vocab_size of .*/config.json is 259"),
+    ("shards", lambda f: (f / "model-00002-of-00007.safetensors").unlink(), "cannot be loaded.*model-00002-of-00007"),
+    ("clip", lambda f: vision(f, width="x"), "open_clip_config.json is no configuration of open_clip's"),
+    ("clip", lambda f: vision(f, width=48), "does not fit its open_clip_config.json .*mismatch for class_embedding"),
+    ("timm", lambda f: (f / ONE).rename(f / "pytorch_model.bin"), "pickles are refused"),
+    ("timm", lambda f: (f / "config.json").unlink(), "config.json does not exist; set encoder.weights=data/weights/"),
 ]
-SHARDS: list[Damage] = [
-    (lambda f: (f / "model-00002-of-00007.safetensors").unlink(), "No such file.*model-00002-of-00007"),
-    (lambda f: edit(f / INDEX, weight_map={}), "shards cannot be loaded"),
-]
-CLIP: list[Damage] = [
-    (lambda f: vision(f, width="x"), "open_clip_config.json is no configuration of open_clip's"),
-    (lambda f: vision(f, width=48), "does not fit its open_clip_config.json .*mismatch for class_embedding"),
-]
-TIMM: list[Damage] = [
-    (lambda f: (f / ONE).rename(f / "pytorch_model.bin"), "pickles are refused"),
-    (lambda f: cut(f / ONE), "^encoder.weights: timm/model.safetensors is cut off"),
-    (lambda f: (f / "config.json").unlink(), "config.json does not exist; set encoder.weights=data/weights/"),
+DOWN, RUNNING = "model.layers.1.mlp.down_proj.weight", "blocks.0.0.bn1.running_var"
+NAN, NO_FIT = "holds values that are not finite; d", r"^encoder.weights: \w+ does not fit its (open_clip_)?config.json"
+AT_LOADING: list[Row] = [
+    ("llama", lambda f: spoil(f, ONE, DOWN), f"^language.weights: {DOWN} in llama/{ONE} {NAN}"),
+    ("clip", lambda f: form_of_clip(f, "text_cfg", hf_model_name="roberta"), "open_clip would ask a hub"),
+    ("timm", lambda f: spoil(f, ONE, RUNNING), f"{RUNNING} in timm/{ONE} {NAN}"),
+    ("timm", lambda f: torch.save({"a": torch.zeros(1)}, f / ONE), NO_FIT),
 ]
 
 
@@ -119,26 +139,14 @@ def test_a_missing_package_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     check_language(MADE_DIR / "smollm2")
 
 
-def check(folder: Path) -> None:
-    """What `octopi scale` asks of a folder."""
-    if folder.name in ("clip", "timm"):
-        check_encoder(folder, 32, (folder.name,))
-        check_encoder_files(folder, (folder.name,))
-    else:
-        check_language(folder)
-        check_language_files(folder)
-
-
-TABLES = {"llama": LLAMA, "shards": SHARDS, "clip": CLIP, "timm": TIMM}
-
-
-@pytest.mark.parametrize(("kind", "damage", "words"), [(kind, *each) for kind, rows in TABLES.items() for each in rows])
-def test_a_broken_folder_is_one_line(kind: str, damage: Callable[[Path], object], words: str) -> None:
+@pytest.mark.parametrize(("ask", "row"), [*((check, row) for row in BROKEN), *((load, row) for row in AT_LOADING)])
+def test_a_broken_folder_is_one_line(ask: Callable[[Path], object], row: Row) -> None:
+    kind, damage, words = row
     folder = WRITE[kind](Path(kind))
-    check(folder)
+    ask(folder)
     damage(folder)
     with refused(words) as caught:
-        check(folder)
+        ask(folder)
     assert str(folder) in str(caught.value)
 
 
@@ -158,44 +166,6 @@ def test_a_padding_token_beyond_the_words_passes() -> None:
     added = json.loads(file.read_text())["added_tokens"]
     edit(file, added_tokens=[*added, added[0] | {"id": 260, "content": "[PAD]"}])
     check_language_files(Path("llama"))
-
-
-# At loading
-
-
-def spoil(folder: Path, file: str, name: str) -> None:
-    value = load_file(folder / file)[name]
-    value.view(-1)[-3] = torch.nan
-    replace(folder / file, name, value)
-
-
-def disguised(file: Path) -> None:
-    torch.save({"a": torch.zeros(1)}, file)
-
-
-DOWN = "model.layers.1.mlp.down_proj.weight"
-RUNNING = "blocks.0.0.bn1.running_var"
-NAN = "holds values that are not finite; d"
-NO_FIT = r"^encoder.weights: \w+ does not fit its (open_clip_)?config.json"
-
-
-@pytest.mark.parametrize(
-    ("kind", "damage", "words"),
-    [
-        ("llama", lambda f: spoil(f, ONE, DOWN), f"^language.weights: {DOWN} in llama/{ONE} {NAN}"),
-        ("clip", lambda f: form_of_clip(f, "text_cfg", hf_model_name="roberta"), "open_clip would ask a hub"),
-        ("timm", lambda f: spoil(f, ONE, RUNNING), f"{RUNNING} in timm/{ONE} {NAN}"),
-        ("timm", lambda f: disguised(f / ONE), NO_FIT),
-    ],
-)
-def test_a_broken_folder_is_one_line_at_loading_too(kind: str, damage: Callable[[Path], object], words: str) -> None:
-    folder = WRITE[kind](Path(kind))
-    damage(folder)
-    with refused(words):
-        if kind == "llama":
-            load_llm(folder, torch.float32)
-        else:
-            base_encoder(config(folder, "tuned", backbone=(kind,)))
 
 
 def test_a_timm_model_that_is_saved_as_the_mend_says_is_taken(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from pipeline.scales import compose
 from pipeline.weights import DOWNLOADED
 from pipeline.weights.check import PUBLISHED_LANGUAGE, check_language_files
 from pipeline.weights.make import CATALOGUE
-from tests.checkpoints import CLIP_CONFIG, contents, cut, edit, replace, write_clip
+from tests.checkpoints import CLIP_CONFIG, contents, cut, edit, write_clip
 from tests.conftest import ROOT, octopi, refused
 
 PICTURES = {"mean": [*open_clip.OPENAI_DATASET_MEAN], "std": [*open_clip.OPENAI_DATASET_STD]}
@@ -38,10 +38,6 @@ LINES = [line for file in sorted(CATALOGUE.iterdir()) for line in file.read_text
 HARD = (
     "", "東京 Überraschung 😀", "two  spaces   three", "\ttab\n\nline ", "1.50 / 23", "x ▁ y", "\0", "e\u0301 ﬁ \u3000x"
 )  # fmt: skip
-LLAMAS_PIECES = {
-    "model_type": "bpe", "vocab_size": WORDS, "pad_id": -1, "unk_id": 0, "bos_id": 1, "eos_id": 2, "split_digits": True,
-    "allow_whitespace_only_pieces": True, "remove_extra_whitespaces": False, "normalization_rule_name": "identity",
-}  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
@@ -54,16 +50,17 @@ def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(open_clip, "get_model_config", lambda name: model if name == "ViT-L-14-quickgelu" else None)
 
 
-def train_pieces(folder: Path, text: str, **how: Any) -> Path:
-    (folder / "text").write_text(text)
-    files = {"input": str(folder / "text"), "model_prefix": str(folder / "tokenizer")}
-    SentencePieceTrainer.train(**files, byte_fallback=True, minloglevel=2, **how)
-    return folder / "tokenizer.model"
-
-
 @pytest.fixture(scope="module")
 def pieces(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return train_pieces(tmp_path_factory.mktemp("pieces"), "\n".join(LINES), **LLAMAS_PIECES)
+    """SentencePiece's, trained as Llama's were."""
+    folder = tmp_path_factory.mktemp("pieces")
+    (folder / "text").write_text("\n".join(LINES))
+    SentencePieceTrainer.train(
+        input=str(folder / "text"), model_prefix=str(folder / "tokenizer"), model_type="bpe", vocab_size=WORDS,
+        byte_fallback=True, split_digits=True, allow_whitespace_only_pieces=True, remove_extra_whitespaces=False,
+        normalization_rule_name="identity", pad_id=-1, unk_id=0, bos_id=1, eos_id=2, minloglevel=2,
+    )  # fmt: skip
+    return folder / "tokenizer.model"
 
 
 def weights() -> dict[str, torch.Tensor]:
@@ -167,43 +164,6 @@ def test_other_files_are_read_too(form: str, vicuna: Path) -> None:
     load_tokenizer(TO)
 
 
-class Evil:
-    def __reduce__(self) -> Any:
-        return Path.touch, (Path("ran"),)
-
-
-def more_words(folder: Path) -> None:
-    train_pieces(folder, "\n".join(LINES), **LLAMAS_PIECES | {"vocab_size": WORDS + 1})
-
-
-Damage = tuple[Callable[[Path], object], str]
-NARROW = {"model.layers.1.mlp.up_proj.weight": torch.zeros(48, 31)}
-VICUNA: list[Damage] = [
-    (lambda f: torch.save({"a": Evil()}, f / SECOND), f"{SECOND} is cut off, or holds more than tensors"),
-    (lambda f: cut(f / SECOND), f"{SECOND} is cut off"),
-    (lambda f: save_shards(f, weights() | NARROW), r"fit its config.json .model.*up_proj.weight is \[48, 31\]"),
-    (lambda f: edit(f / "config.json", hidden_size=64), "download has hidden_size 64, but .* with 32"),
-    (more_words, "tokenizer.json has words up to number 600, but vocab_size of .*config.json is 600"),
-]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ("vicuna-13b nowhere", "no folder; `hf download lmsys/vicuna-13b-v1.5 --local-dir nowhere` makes it"),
-        ("tiny-clip download", "tiny-clip is not downloaded but made; leave download out"),
-        ("vicuna-7b download --to download --trust-pickle", "download is there already; remove it, or .* with --to"),
-        ("vicuna-7b download", f"download/{FIRST} is a pickle.* add --trust-pickle"),
-    ],
-)
-def test_the_command_refuses_what_it_cannot_do(arguments: str, words: str, vicuna: Path) -> None:
-    torch.save({"a": Evil()}, vicuna / FIRST)
-    before = contents(Path())
-    with refused(words):
-        octopi("weights", *arguments.split())
-    assert contents(Path()) == before, "nothing is run or written"
-
-
 def test_they_go_where_the_scales_look_for_them() -> None:
     for scale, name in (("paper-7b", "vicuna-7b"), ("paper-13b", "vicuna-13b")):
         params = compose(scale, conf=ROOT / "conf")
@@ -211,7 +171,7 @@ def test_they_go_where_the_scales_look_for_them() -> None:
         assert params.encoder.weights == f"weights/{DOWNLOADED['clip-vit-large'].folder}"
 
 
-FILE, FORM = "open_clip_model.safetensors", "open_clip_config.json"
+FORM = "open_clip_config.json"
 
 
 @pytest.fixture
@@ -229,27 +189,40 @@ def test_a_clip_as_open_clip_has_it_is_checked_where_it_lies(clip: Path) -> None
     subprocess.run(["sha256sum", "--check", "--strict", "--quiet", "SHA256SUMS"], cwd=clip, check=True)
 
 
-def own(folder: Path, **changes: Any) -> None:
-    edit(folder / FORM, model_cfg=json.loads((folder / FORM).read_text())["model_cfg"] | changes)
+class Evil:
+    def __reduce__(self) -> Any:
+        return Path.touch, (Path("ran"),)
 
 
-CLIP: list[Damage] = [
-    (lambda f: own(f, quick_gelu=None), "clip has quick_gelu None, but .* with True"),
-    (lambda f: cut(f / FILE), f"clip/{FILE} is cut off"),
-    (lambda f: replace(f / FILE, "visual.conv1.weight", torch.zeros(32, 3, 8, 8)), f"{FORM} .*conv1.weight: .*8, 8"),
-]
-TABLES = {"vicuna": VICUNA, "clip": CLIP}
+def evil(folder: Path, file: str = FIRST) -> None:
+    torch.save({"a": Evil()}, folder / file)
 
 
-@pytest.mark.parametrize(("kind", "damage", "words"), [(kind, *each) for kind, rows in TABLES.items() for each in rows])
-def test_a_broken_download_is_one_line_and_leaves_nothing(
-    kind: str, damage: Callable[[Path], object], words: str, request: pytest.FixtureRequest
+NARROW = {"model.layers.1.mlp.up_proj.weight": torch.zeros(48, 31)}
+UNLIKE = CLIP_CONFIG["model_cfg"] | {"quick_gelu": None}
+TRUSTED = "vicuna-7b download --trust-pickle"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "damage", "words"),
+    [
+        ("vicuna-13b nowhere", evil, "no folder; `hf download lmsys/vicuna-13b-v1.5 --local-dir nowhere` makes it"),
+        ("tiny-clip download", evil, "tiny-clip is not downloaded but made; leave download out"),
+        ("vicuna-7b download --to download --trust-pickle", evil, "is there already; remove it, or .* with --to"),
+        ("vicuna-7b download", evil, f"download/{FIRST} is a pickle.* add --trust-pickle"),
+        (TRUSTED, lambda f: evil(f, SECOND), f"{SECOND} is cut off, or holds more than tensors"),
+        (f"{TRUSTED} --to there", lambda f: save_shards(f, weights() | NARROW), r"up_proj.weight is \[48, 31\]"),
+        (TRUSTED, lambda f: edit(f / "config.json", hidden_size=64), "download has hidden_size 64, but .* with 32"),
+        ("clip-vit-large clip", lambda _: edit(Path("clip") / FORM, model_cfg=UNLIKE), "quick_gelu None, but .* True"),
+    ],
+)
+@pytest.mark.usefixtures("clip")
+def test_what_is_refused_is_one_line_and_leaves_nothing(
+    arguments: str, damage: Callable[[Path], object], words: str, vicuna: Path
 ) -> None:
-    folder: Path = request.getfixturevalue(kind)
-    damage(folder)
-    model = "vicuna-7b" if kind == "vicuna" else "clip-vit-large"
+    """Nor is any code run."""
+    damage(vicuna)
     before = contents(Path())
-    for to in ((), ("--to", "there")):
-        with refused(words):
-            octopi("weights", model, folder, "--trust-pickle", *to)
+    with refused(words):
+        octopi("weights", *arguments.split())
     assert contents(Path()) == before
