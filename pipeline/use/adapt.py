@@ -149,16 +149,10 @@ def _without_ratings(model: Octopi, encoded: Sequence[EncodedVideo]) -> Adapted:
     if model.config.encoder.standardize:
         std, mean = torch.std_mean(features, dim=0, correction=0)
         # A dimension that is constant in these frames gives no estimate of its scale, so the old scale stays.
-        std = torch.where(std > 0, std, 1.0)
+        scale = known.scale * torch.where(std > 0, std, 1.0)
         # The features are standardised already, so the new mean and deviation come on top of the old ones.
-        centre = known.mean + mean * known.scale
-        if known.heads is None:
-            statistics = known._replace(mean=centre, scale=known.scale * std)
-        else:
-            # Mean and scale of logits stay those that the language model learnt; ratings that follow need them.
-            weights, biases = known.heads
-            statistics = known._replace(heads=(weights / std[:, None], (biases - centre) / std + known.mean))
-        features = (features - mean) / std
+        statistics = known._replace(mean=known.mean + mean * known.scale, scale=scale)
+        features = (features - mean) / torch.where(std > 0, std, 1.0)
     if isinstance(classifier, JointFrameClassifier) and model.config.encoder_used is Encoder.FINETUNED:
         clips, linear = _clips(encoded), _linear(model)
         # Which classes occur together among the objects of its training says nothing of other objects.
@@ -178,17 +172,13 @@ def _rated(
     read = read_anew(Rated(clips, labels, np.array(objects)), levels, Known(_linear(model), same), seed)
     statistics = model.encoder.statistics
     if statistics.heads is not None:
-        # Of objects that the heads did not see, as all later ones are: of their own they are too sure.
         logits = torch.from_numpy(read.logits)
+        # Of objects that the heads did not see, as all later ones are: of their own they are too sure.
+        std, mean = torch.std_mean(logits, dim=0, correction=0)
         weights, biases = map(torch.from_numpy, read.heads.linear())
-        if same:
-            weights, biases = as_learnt((weights, biases), logits, statistics.scale.split(levels))
-            statistics = statistics._replace(heads=(weights, biases))
-        else:
-            std, mean = torch.std_mean(logits, dim=0, correction=0)
-            statistics = statistics._replace(mean=mean, scale=torch.where(std > 0, std, 1.0), heads=(weights, biases))
-        features = torch.from_numpy(clips).flatten(0, 1).double() @ weights.T + biases
-        features = (features - statistics.mean) / statistics.scale
+        scale = torch.where(std > 0, std, 1.0)
+        statistics = statistics._replace(mean=mean, scale=scale, heads=(weights, biases))
+        features = (torch.from_numpy(clips).flatten(0, 1).double() @ weights.T + biases - mean) / scale
     else:
         plain = _without_ratings(model, encoded)
         statistics, features = plain.statistics, plain.features
@@ -215,31 +205,6 @@ def _rated(
     if not same:
         told += "\nIts language model knows other properties, and is not asked; heads alone answer."
     return Adapted(_tensors(read.heads), statistics, features, told, temperatures)
-
-
-def as_learnt(
-    linear: tuple[torch.Tensor, torch.Tensor], logits: torch.Tensor, learnt: Sequence[torch.Tensor]
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Heads of the same probabilities' order, whose logits spread as far as those that a language model learnt.
-
-    Each property has one factor for all its classes. Standardised class by class, as a language model's own logits are,
-    a frequent class would be no likelier than a rare one: the model learnt from objects of all classes alike.
-
-    Args:
-        linear: Weights, classes of all properties x features, and biases.
-        logits: Of frames of objects that such heads did not see, frames x classes.
-        learnt: Deviations of each property's classes, as the language model learnt them.
-    """
-    counts, weights, biases = [len(scale) for scale in learnt], list[torch.Tensor](), list[torch.Tensor]()
-    for weight, bias, own, scale in zip(
-        *(part.split(counts) for part in linear), logits.split(counts, 1), learnt, strict=True
-    ):
-        # Less their mean, which changes no probability.
-        spread = (own - own.mean(1, keepdim=True)).var(0, correction=0).sum()
-        factor = (scale.square().sum() / spread).sqrt() if spread > 0 else 1.0
-        weights.append(factor * (weight - weight.mean(0)))
-        biases.append(factor * (bias - bias.mean()))
-    return torch.cat(weights), torch.cat(biases)
 
 
 def _expected(read: Reading, labels: np.ndarray, objects: Sequence[str], classes: dict[str, tuple[str, ...]]) -> str:
