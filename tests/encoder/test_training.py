@@ -14,7 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.linear_model import LogisticRegression
 from sklearn.preprocessing import StandardScaler
+from transformers import TrainerCallback
 
+from pipeline.core.layout import PRETRAINED
 from pipeline.core.records import Embedding, Flip, Part
 from pipeline.core.runtime import derive_seed, seed_everything
 from pipeline.encoder import finetune as module
@@ -27,12 +29,12 @@ from pipeline.encoder.recipes import property_classifier
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.training.embeddings import Statistics
 from pipeline.training.sampling import sample_evaluation, sample_training
-from pipeline.training.trainable import trainable_state
+from pipeline.training.trainable import load_trainable, trainable_state
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
 from pipeline.videos.records import Assignment
 from tests.encoder.conftest import Hook, gradient, setting_of
-from tests.encoders import PARTS, config, float64, training, write_frames
+from tests.encoders import PARTS, config, float64, training, write_frames, write_pretrained
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
@@ -117,6 +119,7 @@ def test_autocast_computes_in_bfloat16_and_learns_in_float32(weights: Path, data
     [
         ("paper", (0.1, 0.5, 0.5), 1),
         ("paper", (0.0, 0.0, 0.0), 0),
+        ("paper", (), 2),  # Without validation videos it is the last.
         ("tuned", (0.5, 0.5, 0.5), 0),  # Of `tuned` the first is the probe, which has had no epoch.
         ("tuned", (0.2, 0.4, 0.3), 1),
     ],
@@ -124,15 +127,27 @@ def test_autocast_computes_in_bfloat16_and_learns_in_float32(weights: Path, data
 def test_the_first_of_the_best_epochs_is_kept(
     kind: str, scores: Sequence[float], kept: int, weights: Path, data: EncoderData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    if not scores:
+        data = replace(data, assignments=[a.model_copy(update={"part": Part.TRAIN}) for a in data.assignments])
     seen: list[dict[str, torch.Tensor]] = []
+    script = iter(scores)
+
+    def see(model: torch.nn.Module) -> None:
+        seen.append({n: v.clone() for n, v in trainable_state(model).items()})
+
+    class Remember(TrainerCallback):
+        def on_log(self, *_: object, logs: dict[str, float], model: torch.nn.Module, **__: object) -> None:
+            if "loss" in logs:
+                see(model)
 
     def scripted(_: object, __: object, decide: Any, ___: object) -> dict[str, float]:
-        seen.append({n: v.clone() for n, v in trainable_state(decide.__self__).items()})
-        return {"validation_combined": scores[len(seen) - 1]}
+        if not seen:
+            see(decide.__self__)
+        return {"validation_combined": next(script)}
 
     monkeypatch.setattr(module, "accuracies", scripted)
     setting = setting_of(kind, weights, epochs=2 if kind == "tuned" else 3, batch_size=8)
-    model, history = finetune(training(data, setting))
+    model, history = finetune(training(data, setting, callbacks=[Remember()]))
     found = trainable_state(model)
     assert [all(torch.equal(v, found[n]) for n, v in epoch.items()) for epoch in seen] == [i == kept for i in range(3)]
     assert [m.value for m in history if m.name == "validation_combined"] == list(scores)
@@ -182,15 +197,20 @@ def test_validation_counts_videos_that_are_right_in_everything(catalogue: Catalo
     assert found == pytest.approx({f"validation_{name}": value for name, value in expected.items()})
 
 
-def test_running_statistics_are_saved_with_what_is_trained_alone() -> None:
+def test_running_statistics_are_saved_with_what_is_trained_alone(tmp_path: Path) -> None:
     """As stage `pretrain` saves the whole network, and `tuned` its last layers."""
-    made = SceneEncoder()
-    assert trainable_state(made).keys() == made.state_dict().keys(), "nothing is frozen, so everything is there"
-    made.requires_grad_(False)
-    assert trainable_state(made) == {}, "statistics of frozen layers are not trained"
-    next(layer for layer in made.layers if isinstance(layer, torch.nn.BatchNorm2d)).requires_grad_(True)
+    made = write_pretrained(1)
+    state = trainable_state(made)
+    assert state.keys() == made.state_dict().keys(), "nothing is frozen, so everything is there"
+    other = SceneEncoder().eval()
+    load_trainable(other, PRETRAINED)
+    frames = torch.randint(0, 256, (4, 32, 32, 3), dtype=torch.uint8)
+    assert torch.equal(made(frames, torch.zeros(4)), other(frames, torch.zeros(4)))
+    other.requires_grad_(False)
+    assert trainable_state(other) == {}, "statistics of frozen layers are not trained"
+    next(layer for layer in other.layers if isinstance(layer, torch.nn.BatchNorm2d)).requires_grad_(True)
     names = {"bias", "num_batches_tracked", "running_mean", "running_var", "weight"}
-    assert {n.split(".")[-1] for n in trainable_state(made)} == names
+    assert {n.split(".")[-1] for n in trainable_state(other)} == names
 
 
 def indexed(keys: Iterable[tuple[str, Flip, int]]) -> list[Embedding]:

@@ -6,11 +6,12 @@ from pathlib import Path
 import pytest
 import torch
 from torch.nn import functional as F
-from transformers import LlamaForCausalLM, MistralConfig, MistralForCausalLM
+from transformers import DynamicCache, LlamaForCausalLM, MistralConfig, MistralForCausalLM
 
 from pipeline.config import LanguageConfig
 from pipeline.core.records import Opd, Question
-from pipeline.language import cache, decoding
+from pipeline.language import decoding
+from pipeline.language.cache import AHEAD, roomy_cache
 from pipeline.language.chat import IGNORE_INDEX, encode, render
 from pipeline.language.conversations import evaluation_features
 from pipeline.language.decoding import greedy
@@ -48,24 +49,27 @@ def asked(model: OctopiForCausalLM, shared: int) -> tuple[list[list[int]], list[
     return prompts, features
 
 
+def mistral(window: int | None) -> MistralForCausalLM:
+    """Its layers see the last `window` tokens alone."""
+    shapes = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 4}
+    return MistralForCausalLM(MistralConfig(vocab_size=260, num_key_value_heads=2, sliding_window=window, **shapes))
+
+
 @pytest.fixture(scope="module", params=["llama", "window"])
 def steady(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> OctopiForCausalLM:
     """A Llama, and a model whose layers see the last eight tokens alone."""
     folder = write_llama(tmp_path_factory.mktemp("llama"), seed=4)
     if request.param == "window":
         torch.manual_seed(2)
-        shapes = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 4}
-        form = MistralConfig(vocab_size=260, num_key_value_heads=2, sliding_window=8, **shapes)
-        MistralForCausalLM(form).save_pretrained(folder)
+        mistral(window=8).save_pretrained(folder)
     torch.manual_seed(1)
     return OctopiForCausalLM.from_base(folder, DIM).eval()
 
 
 @pytest.mark.parametrize(("shared", "read"), [(0, 1024), (1, 60), (25, 1), (25, 60)])
 def test_each_row_as_alone(steady: OctopiForCausalLM, shared: int, read: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In one part, in several, in as many as rows; each to its own limit or end; the cache's room is used up often."""
+    """In one part, in several, in as many as rows; each to its own limit or end."""
     monkeypatch.setattr(decoding, "READ", read)
-    monkeypatch.setattr(cache, "AHEAD", 3)
     prompts, features = asked(steady, shared)
     limits = [1 + (5 * number) % 17 for number in range(len(prompts))]
     found = greedy(steady, prompts, features, MANY, limits)
@@ -105,16 +109,36 @@ def test_loss_and_gradients_are_those_of_all_at_once(language: LanguageConfig, t
     labels[:, :17] = IGNORE_INDEX
     parameters = [p for p in model.parameters() if p.requires_grad]
 
-    def gradients(loss: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        return torch.autograd.grad(loss + 0 * sum(p.sum() for p in parameters), parameters)  # Of what is unused, 0.
+    def gradients(loss: torch.Tensor) -> list[torch.Tensor]:
+        found = torch.autograd.grad(loss, parameters, allow_unused=True)
+        return [torch.zeros_like(p) if g is None else g for p, g in zip(parameters, found, strict=True)]
 
     loss = model(ids, features, labels=labels).loss
     logits = model(ids, features).logits
     expected = F.cross_entropy(logits[:, :-1].flatten(0, 1), labels[:, 1:].flatten())
     torch.testing.assert_close(loss, expected, atol=1e-6, rtol=0)
+    if kind == "no frames" and trained == "connector":
+        assert not loss.requires_grad or max(float(g.abs().max()) for g in gradients(loss)) == 0
+        return
     for found, whole in zip(gradients(loss), gradients(expected), strict=True):
         # transformers' normalisation computes in float32 whatever it is given.
         torch.testing.assert_close(found, whole, atol=1e-6, rtol=1e-5)
+
+
+def test_what_all_rows_begin_with_is_read_for_one(language: LanguageConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = OctopiForCausalLM.from_base(language.weights, DIM).eval()
+    places: list[int] = []
+    model.llm.model.layers[0].mlp.register_forward_pre_hook(lambda _, given: places.append(given[0][..., 0].numel()))
+    ids = torch.randint(4, 250, (4, 30), generator=torch.Generator().manual_seed(0))
+    ids[:, :20] = ids[0, :20]
+    ids[:, 20:23] = torch.tensor([model.start_id, model.frame_id, model.end_id])
+    labels, features = ids.clone(), torch.randn(4, 1, DIM)
+    labels[:, :25] = IGNORE_INDEX
+    model(ids, features, labels=labels)
+    assert sum(places) <= 20 + 4 * (30 - 20 + 1)
+    places.clear()
+    greedy(model, ids.tolist(), list(features), (), [1, 1, 1, 9])
+    assert sum(places) == 20 + 4 * 10 + 8, "who has ended is computed no further"
 
 
 @pytest.mark.parametrize("tied", [False, True])
@@ -134,6 +158,19 @@ def test_answers_are_those_of_a_llama_with_these_embeddings(tied: bool, tmp_path
             ids.append(token)
     assert [len(tokens) for tokens in said] == [8, 8]
     assert said[0] != said[1]
+
+
+@pytest.mark.parametrize("window", [None, 8])
+def test_the_cache_gives_back_what_transformers_own_does(window: int | None) -> None:
+    torch.manual_seed(0)
+    llm = mistral(window).eval()
+    own, other = roomy_cache(llm.config), DynamicCache(config=llm.config)
+    for start, stop in ((0, 5), (5, 6), (6, 7), (7, 7 + AHEAD), (7 + AHEAD, 8 + AHEAD)):
+        ids = torch.randint(0, 50, (3, stop - start), generator=torch.manual_seed(stop))
+        with torch.no_grad():
+            found, expected = (llm(ids, past_key_values=cache, use_cache=True).logits for cache in (own, other))
+        torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
+        assert own.get_seq_length() == other.get_seq_length() == stop
 
 
 def prompt(question: Question, opd: Opd, model: OctopiForCausalLM) -> list[int]:

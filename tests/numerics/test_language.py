@@ -17,6 +17,7 @@ import torch
 from scipy.special import logsumexp
 from torch import nn
 from torch.nn import functional as F
+from torch.nn.utils import parameters_to_vector
 from transformers.modeling_outputs import CausalLMOutput
 
 from pipeline.config import LoraTrainConfig
@@ -26,7 +27,7 @@ from pipeline.language.lora import add_lora
 from pipeline.language.octopi import OctopiForCausalLM
 from tests.checkpoints import model_folder
 from tests.numerics.bounds import longest_sum, magnification, rounded, summing
-from tests.numerics.harness import FLOAT32, FLOAT64, NETWORKS, Check, Format, formats
+from tests.numerics.harness import BFLOAT16, FLOAT16, FLOAT32, FLOAT64, NETWORKS, Check, Format, formats
 
 PART = "language"
 DIM, FRAMES, LENGTH = 64, 4, 40
@@ -129,6 +130,31 @@ def test_a_fresh_adapter_is_the_identity(check: Check, fmt: Format) -> None:
     add_lora(model, PAPER)
     name = f"fresh adapter, alpha {PAPER.alpha:g}, rank {PAPER.rank}, against none"
     check(name, fmt, lambda _: before - answered(model.to(fmt.device).eval()), 0, 0.0)
+
+
+@formats(FLOAT32, BFLOAT16, FLOAT16)
+def test_what_is_trained_is_float32_and_moves_as_adam_says(check: Check, fmt: Format) -> None:
+    """The first step is rate x g / (|g| + eps), however small gradients g are: a half format would lose both the step
+    beside the weight and an eps of 1e-8, whose loss makes 0 / 0 of a gradient of 0.
+
+    roundings: some 8 operations on a step, and that of the weight.
+    """
+    model, rate = octopi(), 1e-5
+    model.llm.to(fmt.torch)
+    add_lora(model, PAPER)
+    trained = [p for p in model.to(fmt.device).train().parameters() if p.requires_grad]
+    assert {p.dtype for p in trained} == {torch.float32}
+    ids, features = conversation(model)
+    model(ids, features, labels=ids.masked_fill(ids > 199, IGNORE_INDEX)).loss.backward()
+    for parameter in trained:
+        parameter.grad.mul_(1e-6)
+    before = parameters_to_vector(trained).detach().double()
+    slope = torch.cat([p.grad.flatten().double() for p in trained])
+    torch.optim.AdamW(trained, lr=rate, weight_decay=0).step()
+    after = parameters_to_vector(trained).detach().double()
+    exact = -rate * slope / (slope.abs() + 1e-8)
+    bound = (8 + float(before.abs().max()) / float(exact.abs().max())) * FLOAT32.roundoff
+    check("first step of Adam, gradients times 1e-6", fmt, lambda _: after - before, bound, exact.cpu().numpy())
 
 
 STEPS = np.array([[0, 1, -1, 3, 3], [7, -7, 0, 0, 1], [2, 2, 2, 2, 2], [-5, 4, 4, -5, 6]])

@@ -85,6 +85,8 @@ def test_one_fold_of_three_is_reported_as_one(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr("pipeline.report.provenance.NOTES", tmp_path / "notes.yaml")
     folder = run(tmp_path, "[1]")
     assert load_report(folder).provenance["settings"] == "of this one"
+    (tmp_path / "notes.yaml").write_text("others:\n  smoke-scenes/kfold: of this one\n")
+    assert load_report(run(tmp_path / "other", "[1]")).provenance["settings"] == ""
     assert load_report(folder).provenance["folds"] == {"of": 3, "tested": [1], "trained": 0}
     graded = read_table(tmp_path / "data" / "graded.parquet", Graded)
     assert {(g.seed, g.trained) for g in graded} == {(0, 1)}

@@ -174,8 +174,10 @@ def test_what_is_missing_is_said_with_the_reason(changed: Path, monkeypatch: pyt
 @pytest.mark.parametrize(
     ("said", "covered"),
     [
+        ({"name": "avocado-scenes", "source": "scenes", "task": "RIPE"}, set()),
         ({"name": "avocado-videos", "task": "RIPE"}, {"RIPE"}),
         ({"name": "paper-7b-videos", "touch": "photos"}, {"paper-7b-videos", "avocados photos"}),
+        ({"name": "paper-7b-videos", "touch": "photos", "dataset": "PhysiCLeAR"}, {"paper-7b-videos"}),
     ],
 )
 def test_what_only_users_can_measure_is_missing_until_they_have(said: dict[str, str], covered: set[str]) -> None:

@@ -22,8 +22,6 @@ from tests.report.conftest import effect, report, score
 
 PRINTED = [f"Published {model} % (n, ~ inferred)" for model in ("7b", "13b", "PG-InstructBLIP")]
 BY_KEY = {table.key: table for table in TABLES}
-AXES = itertools.product(("base", "finetuned"), ("without", "with"), ("none", "needed", "all"))
-VARIANTS = [" ".join(axes) for axes in AXES]
 
 
 def build(key: str, *rows: dict[str, object], dataset: str = load.DATASET) -> pd.DataFrame:
@@ -65,13 +63,15 @@ def test_effects_are_written_in_points_and_what_is_unknown_is_empty() -> None:
     ],
 )
 def test_each_of_the_papers_tables_changes_one_part_only(key: str, systems: list[str]) -> None:
-    shown = build(key, *(score(variant=v) for v in VARIANTS), score(seed="0"), score(touch="swapped"))
+    axes = itertools.product(("base", "finetuned"), ("without", "with"), ("none", "needed", "all"))
+    shown = build(key, *(score(variant=" ".join(v)) for v in axes), score(seed="0"), score(touch="swapped"))
     assert list(shown["System"]) == systems
     assert all(shown[PRINTED[0]])
 
 
 def test_all_other_variants_are_those_that_no_table_of_an_ablation_has() -> None:
-    shown = build("variants", *(score(variant=v) for v in VARIANTS))
+    axes = itertools.product(("base", "finetuned"), ("without", "with"), ("none", "needed", "all"))
+    shown = build("variants", *(score(variant=" ".join(v)) for v in axes))
     left = ["finetuned with needed", "finetuned without none", "base with none", "base without all"]
     found = [" ".join(row) for row in shown[["Encoder", "LoRA", "OPD"]].itertuples(index=False)]
     assert {v.replace("finetuned", "fine-tuned") for v in left} < {*found}
@@ -203,10 +203,21 @@ def test_what_was_found_and_what_it_stands_on() -> None:
     first, stands_on = text.split("## What the figures stand on")
     assert "in 2 of 3 tasks (OPD, PC) and below it in PSS" in first
     assert "PC full system - heads and rules -17.0, PC real - swapped +10.0 points" in first
+    assert "went on from `octopi-small`" in first
     assert "(3 of 5 folds are still to be run)" in first
     told = ("a 2.2 M-parameter Llama, taught by hand", "2 of 5 folds (0, 2)", "Looked at before.", "to be narrow.")
-    told += ("**Matching questions** say what the named objects are like", "questions: `restate=True`; lora: `dropout")
     assert all(fact in stands_on for fact in told)
+    assert "**Matching questions** say what the named objects are like" in stands_on
+    assert "questions: `restate=True`; lora: `dropout=0.0`; language: `start=" in stands_on
+    assert "sha256 `cccccccccccccccc`" in stands_on
+
+
+def test_nothing_measured_or_otherwise_is_said_so() -> None:
+    text = render_readme(report(language={"parameters": 6_738_415_616, "taught": ""}), [])
+    assert text.count("No answer of the full system was graded.") == 2
+    assert "not tested" in text
+    assert "place of the paper's" not in text, "a Vicuna is no stand-in"
+    assert "<details>" not in text, "nothing is otherwise"
 
 
 @pytest.mark.parametrize(

@@ -127,17 +127,27 @@ def public(real_data: Path, catalogue: Catalogue) -> list[Finding]:
 @pytest.mark.real
 def test_odd_public_videos_are_found_without_being_told(public: list[Finding]) -> None:
     assert [f for f in public if f.severity is ERROR] == []
-    assert odd(of(public, "near-duplicate")) == []
+    assert [f.measured for f in of(public, "frames that decode")] == ["0 of 370 videos differ from their header"]
+    assert [f.item for f in of(public, "same content")] == ["all"]
+    near = [f for f in of(public, "near-duplicate") if f.item != "all"]
+    assert odd(near) == []
+    assert all("the same object" in f.measured for f in near)
     short = {f.item: f.measured for f in of(odd(public), "length")}
     assert short == {"hairbrush_bristles_side_4.mov": "3 frames", "tv_remote_back_3.mov": "7 frames"}
     assert [(f.item, f.measured) for f in of(odd(public), "frame rate")] == [("10 frames/s", "66 videos")]
     still = {f.item for f in of(public, "contact at the end")}
     assert still >= {"scissor_handle_1.mov", "gauze_pad_0.mov"}
+    assert len(still) <= 15
     unclear = [f.item.rpartition("_")[0] for f in of(odd(public), "contact")]
     assert {*unclear} >= {"cotton_ball", "sponge_soft"}
+    assert len(unclear) <= 25
+    shared = of(public, "session in two parts")
+    assert {f.severity for f in shared} == {WARNING}
+    assert {f.item for f in shared} <= {f.item for f in of(public, "session")}
     hardness = of(public, "predicted from the no-contact reference alone")[0]
     assert (hardness.item, hardness.severity) == ("hardness", WARNING)
     assert float(hardness.measured.split()[0]) == pytest.approx(52, abs=6)
+    assert float(hardness.expected.split()[0]) == pytest.approx(40, abs=4)
     assert float(hardness.measured.split()[-1]) < leakage.ALPHA
 
 
@@ -217,7 +227,10 @@ def test_brightness_is_judged_by_the_spread_at_the_same_rate() -> None:
 def test_videos_an_object_and_objects_without() -> None:
     findings = list(check_files([*probes(2, OBJECTS[:5]), *probes(4, OBJECTS[5:7])], OTHER))
     assert [f.measured for f in of(findings, "videos per object")] == ["5 objects with 2, 2 objects with 4"]
-    assert [(f.item, f.severity) for f in of(findings, "videos")] == [("all", INFO), ("orange", WARNING)]
+    assert [(f.item, f.measured, f.severity) for f in of(findings, "videos")] == [
+        ("all", "18 videos of 7 objects", INFO),
+        ("orange", "no video", WARNING),
+    ]
 
 
 SHROUT_FLEISS = [[9, 2, 5, 8], [6, 1, 3, 2], [8, 4, 6, 8], [7, 1, 2, 6], [10, 5, 6, 9], [6, 2, 4, 7]]
@@ -258,11 +271,22 @@ def test_the_catalogues_labels_agreement_descriptions_and_splits(catalogue: Cata
     }
 
 
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [("It is soft.", 1), ("It is hard.", 0), ("It is soft on a hard core.", 0), ("It is red.", 0), ("", 0)],
+)
+def test_a_description_is_named_that_has_another_class_alone(text: str, told: int) -> None:
+    rug = Catalogue(language=OTHER.language, objects={"rug": OTHER.objects["rug"]})
+    found = check_labels(made.relabelled(rug, ratings=((2,), (0,), (0,)), description=text))
+    assert [f.item for f in of(found, "description")] == ["rug: hardness"] * told
+
+
 def test_agreement_is_undefined_without_variance_with_one_rating_or_unequal_numbers() -> None:
     rug = OTHER.objects["rug"]
     fewer = rug.model_copy(update={"ratings": (rug.ratings[0][:2], *rug.ratings[1:])})
     for catalogue, undefined in (
         (made.relabelled(OTHER, ratings=((1,), (0,), (2,))), [True] * 3),
+        (made.relabelled(OTHER, ratings=((1, 1, 1),) * 3), [True] * 3),
         (Catalogue(language=OTHER.language, objects={**OTHER.objects, "rug": fewer}), [True, False, False]),
     ):
         found = of(check_labels(catalogue), "agreement, ICC(3,k)")
@@ -272,7 +296,9 @@ def test_agreement_is_undefined_without_variance_with_one_rating_or_unequal_numb
 def test_classes_that_nobody_chose_and_stated_labels() -> None:
     found = list(check_labels(made.relabelled(OTHER, ratings=((0, 0),) * 3, splits={"mine": Part.TEST})))
     assert [f.severity for f in of(found, "objects of a class")] == [INFO, WARNING, WARNING] * 3
-    assert [f.measured for f in of(found, "classes of a part")][:1] == ["no moderately hard or hard"]
+    lacking = of(found, "classes of a part")
+    assert [f.item for f in lacking] == [f"mine, test: {p}" for p in ("hardness", "roughness", "bumpiness")]
+    assert lacking[0].measured == "no moderately hard or hard"
     right = {o: e.model_copy(update={"stated": e.labels}) for o, e in OTHER.objects.items()}
     for silent in (made.relabelled(OTHER, stated=(None,) * 3), Catalogue(language=OTHER.language, objects=right)):
         assert of(check_labels(silent), "stated label") == []

@@ -22,7 +22,9 @@ pytestmark = pytest.mark.usefixtures("few_permutations")
 
 def test_objects_stand_in_one_part() -> None:
     clean = leaks(probes(), GOOD_SPLIT, OTHER)
-    assert [f.item for check in ("same content", "near-duplicate") for f in of(clean, check)] == ["all"] * 2
+    assert [f.measured for f in of(clean, "object in two parts")] == ["0 of 8 objects"]
+    assert [f.measured for f in of(clean, "same content")] == ["0 of 24 files"]
+    assert [f.item for f in of(clean, "near-duplicate")] == ["all"]
     spare, without = leaks(probes(), {**GOOD_SPLIT, "rug_1": Part.UNUSED}, OTHER), leaks(probes(), {}, OTHER)
     assert of(without, "session in two parts") == []
     crossing = leaks(probes(), {**GOOD_SPLIT, "rug_1": Part.TEST}, OTHER)
@@ -140,9 +142,14 @@ def test_sessions_are_told_apart_by_the_untouched_picture(monkeypatch: pytest.Mo
 
 def test_formats_and_names_are_sessions_of_their_own() -> None:
     look = {"thumbnail": tuple(np.linspace(50, 130, 144))}
-    changes = ({}, {}, {"fps": 10.0}, {"session": "monday"}, {"session": "tuesday", "fps": 10.0})
-    found = sessions([probe(f"rug_{number}", **look, **own) for number, own in enumerate(changes)])
-    assert found == [*["25 frames/s, 320x240, look 1"] * 2, "10 frames/s, 320x240, look 1", "monday", "tuesday"]
+    found = [
+        *(probe(f"rug_{i}", **look) for i in range(3)),
+        *(probe(f"potato_{i}", **look, fps=10.0) for i in range(2)),
+        probe("lemon_0", **look, session="monday"),
+        probe("lemon_1", **look, session="tuesday", fps=10.0),
+    ]
+    fast, slow = "25 frames/s, 320x240, look 1", "10 frames/s, 320x240, look 1"
+    assert sessions(found) == [fast, fast, fast, slow, slow, "monday", "tuesday"]
 
 
 def test_a_session_in_training_and_test_is_a_warning() -> None:
@@ -161,13 +168,16 @@ def test_a_session_in_training_and_test_is_a_warning() -> None:
 # Whether the untouched sensor tells the label: against scikit-learn, planted leaks and pure noise
 
 
-def planted(seed: int, *, leak: float, dims: int = 6) -> tuple[np.ndarray, list[int], list[str]]:
-    """Features, labels and objects of unequal numbers of videos; `leak` moves features with the label."""
-    objects = 24
+def planted(
+    seed: int, *, leak: float, objects: int = 24, dims: int = 6, own: float = 0.0
+) -> tuple[np.ndarray, list[int], list[str]]:
+    """Features, labels and objects of unequal numbers of videos; `leak` moves features with the label, `own` with the
+    object."""
     rng = np.random.default_rng(seed)
     label = rng.integers(0, 3, objects)
     member = rng.permutation(np.repeat(np.arange(objects), rng.integers(1, 6, objects)))
-    features = leak * rng.normal(size=(3, dims))[label[member]] + rng.normal(size=(len(member), dims))
+    centres, looks = rng.normal(size=(3, dims)), rng.normal(size=(objects, dims))
+    features = leak * centres[label[member]] + own * looks[member] + rng.normal(size=(len(member), dims))
     return features, label[member].tolist(), [f"object {m:02}" for m in member]
 
 

@@ -20,6 +20,11 @@ from pipeline.videos.catalogue.wording import levels_named, mentioned
 from pipeline.videos.split import VALIDATION, assign, untested
 from tests.conftest import CATALOGUE, PHYSICLEAR, fake_videos, refused
 
+PAPER_TEST = {
+    *("bath_towel", "clothes_peg", "hairbrush_bristles", "hairbrush_handle", "ice_block", "microfiber_cloth"),
+    "toilet_brush_bristles",
+}
+
 
 def test_objects_parts_and_names(catalogue: Catalogue) -> None:
     paper, release = (
@@ -27,7 +32,8 @@ def test_objects_parts_and_names(catalogue: Catalogue) -> None:
         for split in ("paper", "release")
     )
     assert [len(paper[part]) for part in (Part.TRAIN, Part.VALIDATION, Part.TEST)] == [60, 7, 7]
-    assert release[Part.TEST] == paper[Part.TEST] - {"ice_block", "clothes_peg"} | {"orange", "eraser"}
+    assert paper[Part.TEST] == PAPER_TEST
+    assert release[Part.TEST] == PAPER_TEST - {"ice_block", "clothes_peg"} | {"orange", "eraser"}
     assert release[Part.VALIDATION] == paper[Part.VALIDATION] - {"bubble_wrap"} | {"lemon"}
     names = {o.name.lower() for o in catalogue.objects.values()}
     assert len(names) == 74 == len(catalogue.objects), "options of a matching question are told apart by name"
@@ -76,12 +82,12 @@ BALL = "ball,a ball,1 1 2,0,0 0 1"
 BOWL = BALL.replace("ball,a ball", "bowl,a bowl")
 
 
-def write(folder: Path, *lines: str, **more: Sequence[str]) -> Path:
+def write(folder: Path, *lines: str, encoding: str = "utf-8", **more: Sequence[str]) -> Path:
     """A catalogue with PhysiCLeAR's language and these lines."""
     shutil.copy(PHYSICLEAR / "properties.yaml", folder)
-    (folder / "objects.csv").write_text("\n".join(lines) + "\n")
+    (folder / "objects.csv").write_text("\n".join(lines) + "\n", encoding=encoding)
     for file, told in more.items():
-        (folder / f"{file}.csv").write_text("\n".join(told) + "\n")
+        (folder / f"{file}.csv").write_text("\n".join(told) + "\n", encoding=encoding)
     return folder
 
 
@@ -94,14 +100,23 @@ def write(folder: Path, *lines: str, **more: Sequence[str]) -> Path:
         ([HEADER, GOOD.replace("train,train", "train,trian")], "line 2.*split_release.*trian.*validation"),
         ([HEADER, GOOD.replace("ball,", "../../evil,", 1)], r"line 2.*'\.\./\.\./evil'.*letters, digits"),
         ([f"{SHORT},label_hardnes", f"{BALL},1"], r"objects\.csv.*label_hardnes .*no property"),
-        ({"descriptions": ["object_id,description", "balll,round"]}, r"descriptions\.csv, line 2.*'balll'.*objects"),
-        ({"texts": ["object_id,text", '"ball","Round. Overall, hard."']}, r"texts\.csv.*line 2.*'Overall'"),
     ],
 )
-def test_a_bad_table_is_one_clear_line(tmp_path: Path, lines: list[str] | dict[str, list[str]], words: str) -> None:
-    """The table of objects, or another beside a good one."""
+def test_a_bad_table_is_one_clear_line(tmp_path: Path, lines: list[str], words: str) -> None:
     with refused(words):
-        load_catalogue(write(tmp_path, SHORT, BALL, **lines) if isinstance(lines, dict) else write(tmp_path, *lines))
+        load_catalogue(write(tmp_path, *lines))
+
+
+@pytest.mark.parametrize(
+    ("file", "lines", "words"),
+    [
+        ("descriptions", ["object_id,description", "ball,round", "balll,round"], r"line 3.*'balll'.*objects\.csv"),
+        ("texts", ["object_id,text", '"ball","Round. Overall, it presents a hard surface."'], "line 2.*'Overall'"),
+    ],
+)
+def test_a_bad_description_is_one_clear_line(tmp_path: Path, file: str, lines: list[str], words: str) -> None:
+    with refused(rf"{file}\.csv.*{words}"):
+        load_catalogue(write(tmp_path, SHORT, BALL, **{file: lines}))
 
 
 def test_texts_are_told_where_they_are_asked_for_and_packed_nowhere(tmp_path: Path) -> None:
@@ -128,9 +143,14 @@ def test_what_publishers_add(tmp_path: Path) -> None:
     assert load_catalogue(write(tmp_path, SHORT, BALL)).split_names == ()
 
 
-def test_ratings_may_be_written_as_decimals(tmp_path: Path) -> None:
-    whole = load_catalogue(write(tmp_path, SHORT, BALL))
-    assert load_catalogue(write(tmp_path, SHORT, "ball,a ball,1.0 1 2.00,0,0 0 1")).objects == whole.objects
+def test_a_spreadsheet_s_csv_is_read(tmp_path: Path) -> None:
+    lines = [SHORT.replace(",", " , "), "", BALL.replace(",", ", "), ",,,,"]
+    loaded = load_catalogue(write(tmp_path, *lines, descriptions=["object_id,description"], encoding="utf-8-sig"))
+    assert loaded.objects["ball"].name == "a ball"
+    as_decimals = "ball,a ball,1.0 1 2.00,0,0 0 1"
+    assert load_catalogue(write(tmp_path, SHORT, as_decimals)).objects == loaded.objects
+    with refused(r"objects\.csv.*UTF-8"):
+        load_catalogue(write(tmp_path, SHORT, BALL.replace("a ball", "a käse"), encoding="latin-1"))
 
 
 @pytest.mark.parametrize(
@@ -256,6 +276,9 @@ def test_fewer_training_objects_change_no_other_part() -> None:
 
 
 def test_missing_objects_are_reported() -> None:
+    tested = {o for o in OBJECTS if CATALOGUE.objects[o].splits["paper"] == Part.TEST}
+    present = {*OBJECTS} - tested - {"denim"}
+    assert not parts(present, name="paper")[Part.TEST]
     said = untested({"rug": Part.TRAIN, "denim": Part.TEST, "mug": Part.UNUSED}, {"rug", "mug", "new"})
     assert "1 of 1 test objects have no videos (denim)" in said
     assert "2 with videos are in no part (mug, new)" in said
@@ -263,11 +286,29 @@ def test_missing_objects_are_reported() -> None:
     assert untested({"rug": Part.TRAIN, "denim": Part.TEST}, {"rug", "denim"}) == ""
 
 
-@pytest.mark.parametrize("name", ["paper", "release"])
+def renamed(**columns: str) -> Catalogue:
+    """The catalogue with other split columns: new name to old."""
+    objects = {
+        name: entry.model_copy(update={"splits": {new: entry.splits[old] for new, old in columns.items()}})
+        for name, entry in CATALOGUE.objects.items()
+    }
+    return CATALOGUE.model_copy(update={"objects": objects})
+
+
+@pytest.mark.parametrize("name", ["paper", "release", "mine"])
 def test_a_column_is_a_split(name: str) -> None:
-    split = assign(CATALOGUE, fake_videos(OBJECTS), SplitConfig(name=name))
-    assert {(a.object_id, a.part) for a in split} == {(o, CATALOGUE.objects[o].splits[name]) for o in OBJECTS}
-    with refused("split.name=mine is no split of the catalogue; allowed: paper, release, kfold "):
-        assign(CATALOGUE, fake_videos(OBJECTS), SplitConfig(name="mine"))
+    catalogue = renamed(paper="paper", release="release", mine="paper")
+    split = assign(catalogue, fake_videos(OBJECTS), SplitConfig(name=name))
+    assert {(a.object_id, a.part) for a in split} == {(o, catalogue.objects[o].splits[name]) for o in OBJECTS}
+
+
+def test_a_split_that_is_not_there_is_refused() -> None:
+    with refused("split.name=mine is no split of the catalogue; allowed: paper, kfold "):
+        assign(renamed(paper="paper"), fake_videos(OBJECTS), SplitConfig(name="mine"))
+    assert assign(renamed(), fake_videos(OBJECTS), SplitConfig(name="kfold"))
+
+
+@pytest.mark.parametrize("objects", [["denim", "ice_block"], []])
+def test_nothing_to_train_on(objects: list[str]) -> None:
     with refused("no video of a training object"):
-        parts([], name=name)
+        parts(objects, name="paper")

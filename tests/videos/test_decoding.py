@@ -10,10 +10,12 @@ import av
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pipeline.config import FramesConfig
 from pipeline.use.media import count_frames
-from pipeline.videos.decoding import Decoder, Header, fit, picture, planes, turns
+from pipeline.videos.decoding import Decoder, Header, fit, picture, planes, to_rgb, turns
 from pipeline.videos.film import KEY_EVERY, write_film
 from tests.conftest import HUNG, encode, moving_square, refused, write_video
 from tests.frame_rules import decode, frames_of, pillow, scanned
@@ -79,12 +81,30 @@ def test_pictures_follow_range_and_format(tmp_path: Path, codec: str, pixels: st
         assert found.shape == expected.shape == (3, height, width, 3)
         assert np.abs(found - expected).max() <= 12, "where sides are odd, decoders differ in how they spread colour"
         assert np.abs(found - expected).mean() <= 1.2
+    (frame,) = frames_of(encode(tmp_path / f"w.{suffix}", [gradient(48, 64)], codec, pixels))
+    for size in (16, 96):
+        expected = cv2.resize(picture(frame)[:, 8:56, ::-1], (size, size), interpolation=cv2.INTER_AREA).astype(int)
+        error = np.abs(fit(frame, FramesConfig(pixels=size)) - expected)
+        # Twice the size and bent edges: a picture enlarged in blocks is off by a step or two of the gradient.
+        assert error.mean() < 2
+        assert error.max() <= 8
     # Full range or not: 0 is black, 255 is white; the encoder's own rounding takes up to 5 steps.
     for value in (0, 16, 77, 128, 235, 255):
         (frame,) = frames_of(encode(tmp_path / f"g.{suffix}", [np.full((32, 32, 3), value, np.uint8)], codec, pixels))
         shown = picture(frame)[0, 0, ::-1].astype(int)
         assert np.abs(shown - value).max() <= 5
         assert np.abs(fit(frame, FramesConfig(pixels=16)) - shown).max() <= 2
+
+
+@given(st.tuples(st.integers(16, 235), st.integers(16, 240), st.integers(16, 240)))
+def test_colours_are_those_of_the_recommendation(yuv: tuple[int, int, int]) -> None:
+    """ITU-R BT.601 with its constants as they are printed in textbooks."""
+    y, u, v = yuv[0] - 16, yuv[1] - 128, yuv[2] - 128
+    limited = [1.164384 * y + 1.596027 * v, 1.164384 * y - 0.391762 * u - 0.812968 * v, 1.164384 * y + 2.017232 * u]
+    full = [yuv[0] + 1.402 * v, yuv[0] - 0.344136 * u - 0.714136 * v, yuv[0] + 1.772 * u]
+    for pixels, rgb in (("yuv420p", limited), ("yuvj420p", full)):
+        found = to_rgb(np.full((1, 1, 3), yuv, np.uint8), av.VideoFrame(2, 2, pixels))[0, 0]
+        assert found == pytest.approx(np.clip(rgb, 0, 255), abs=1)
 
 
 def test_a_stream_that_names_bt709_is_taken_at_its_word() -> None:

@@ -2,13 +2,14 @@
 
 import math
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 from pipeline.config import FramesConfig
 from pipeline.use.frames import read_touch
-from pipeline.videos.decoding import Decoder, fit, picture
+from pipeline.videos.decoding import Decoder, fit, picture, planes
 from pipeline.videos.frames import selection
 from pipeline.videos.frames.reference import reference_indices, thumbnail
 from tests import frame_rules
@@ -114,6 +115,16 @@ def test_a_warm_up_changes_nothing_else(tmp_path: Path, name: str, gains: list[f
         assert min(k.index for k in found.kept) >= cold + (name == "salient"), "no difference in light is kept"
 
 
+@pytest.mark.parametrize(("gains", "opened"), [([], 1), (WARM_UP, 2)])
+def test_a_video_is_decoded_twice_at_most(tmp_path: Path, gains: list[float], opened: int) -> None:
+    """The second has no number of frames in its header, light that rises, and contact at its beginning."""
+    depths = rise(100)[::-1] if gains else rise(100)
+    path = encode(tmp_path / ("v.mkv" if gains else "v.avi"), warmed(film(depths), gains))
+    with patch.object(Decoder, "frames", autospec=True, side_effect=Decoder.frames) as decoded:
+        scanned(path)
+    assert decoded.call_count == opened
+
+
 def test_a_warm_up_is_noted_and_hides_no_lack_of_contact(tmp_path: Path) -> None:
     frames = warmed(film([0.0] * 60), WARM_UP)
     first, second = read_touch(encode(tmp_path / "v.avi", frames), FramesConfig(pixels=32), quiet=1.0).notes
@@ -129,6 +140,15 @@ def test_a_steady_press_has_the_reference_that_it_had(tmp_path: Path) -> None:
     ):
         found = filmed(tmp_path / f"{number}.avi", film(depths, light=light), "salient", lossless=True).probe
         assert (found.unsteady, found.untouched) == (unsteady, reference_indices(len(depths)))
+
+
+@pytest.mark.parametrize(("height", "width"), [(240, 320), (17, 97), (1, 1), (600, 4)])
+def test_thumbnails_keep_the_shape(tmp_path: Path, height: int, width: int) -> None:
+    (frame,) = frames_of(encode(tmp_path / "v.mkv", [np.full((height, width, 3), 128, np.uint8)], "ffv1", "yuv420p"))
+    thumb = thumbnail(frame)
+    rows, columns = (max(1, round(80 * min(1, share))) for share in (height / width, width / height))
+    assert thumb.shape == (rows, columns, 3)
+    assert (thumb[..., 0] == planes(frame)[0][0, 0]).all()
 
 
 def assert_fitted(path: Path, found: Scanned) -> None:
