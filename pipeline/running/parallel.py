@@ -19,6 +19,8 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
+from threadpoolctl import threadpool_limits
+
 from pipeline.config import Backend
 from pipeline.config.params import check_code
 from pipeline.core.runtime import PORTABLE, DeviceName, cores
@@ -154,7 +156,11 @@ def _in_processes(work: Callable[[J], R], jobs: Sequence[J], label: str) -> Iter
 
 
 def _serve(parent: int, work: Callable[[J], R], pipe: Connection) -> None:
-    """What a worker does until it is ended: take a job, and hand over its result or error."""
+    """What a worker does until it is ended: take a job, and hand over its result or error.
+
+    Each core has a worker, so that threads of BLAS would only wait for each other: objects were invented half as fast.
+    """
+    threadpool_limits(1, user_api="blas")
     end_with_parent(parent)
     while True:
         job = pipe.recv()
