@@ -333,12 +333,17 @@ def test_any_path_is_printed(tmp_path: Path) -> None:
 SCRIPT = """
 import os, sys, time
 from pathlib import Path
+os.environ.pop("OMP_NUM_THREADS", None)  # The tests' own.
+import numpy
+from threadpoolctl import threadpool_info
 from pipeline.running import parallel
 from pipeline.running.errors import UserError
 from pipeline.running.parallel import run_parallel, use_backend
 
 def fails(job):
     Path("last").write_text(str(job))
+    # A thread of BLAS for each core in each worker, and they would wait for each other.
+    assert {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"} == {1}
     if job == "refused":
         raise UserError("file 7 is broken; mend it")
     if job == "dies":
