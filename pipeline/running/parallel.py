@@ -158,7 +158,8 @@ def _in_processes(work: Callable[[J], R], jobs: Sequence[J], label: str) -> Iter
 def _serve(parent: int, work: Callable[[J], R], pipe: Connection) -> None:
     """What a worker does until it is ended: take a job, and hand over its result or error.
 
-    Each core has a worker, so that threads of BLAS would only wait for each other: objects were invented half as fast.
+    Each core has a worker, so that threads of BLAS would wait for each other: with them, two cores took 1.6 times as
+    long to invent 54 objects, and 1.5 times to make 27 scenes.
     """
     threadpool_limits(1, user_api="blas")
     end_with_parent(parent)
