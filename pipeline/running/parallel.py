@@ -19,8 +19,6 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
-from threadpoolctl import threadpool_limits
-
 from pipeline.config import Backend
 from pipeline.config.params import check_code
 from pipeline.core.runtime import PORTABLE, DeviceName, cores
@@ -161,6 +159,8 @@ def _serve(parent: int, work: Callable[[J], R], pipe: Connection) -> None:
     Each core has a worker, so that threads of BLAS would wait for each other: with them, two cores took 1.6 times as
     long to invent 54 objects, and 1.5 times to make 27 scenes.
     """
+    from threadpoolctl import threadpool_limits  # Here, since most stages and commands start no worker.
+
     threadpool_limits(1, user_api="blas")
     end_with_parent(parent)
     while True:
