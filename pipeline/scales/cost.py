@@ -14,13 +14,13 @@ from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import list_videos
 from pipeline.videos.frames.selection import kept_count
 from pipeline.videos.split import MORE, assign_objects, few
-from pipeline.weights import DOWNLOADED
+from pipeline.weights import DOWNLOADED, made
 from pipeline.weights.check import parameters
 
 GB = 1e9
 USUAL_FRAMES = 112
 """Frames of a video, which is not opened to count them: the paper's average."""
-PACKAGES, CLIP = 7.5 * GB, 1.7 * GB
+PACKAGES, CLIP = 7.7 * GB, 1.7 * GB
 """What `make install` puts into .venv, and the download of CLIP ViT-L/14 with its text tower."""
 CARDS = (24, 40, 48, 80)
 """Memory of usual cards, in GB."""
@@ -111,9 +111,15 @@ def disk(params: Params, shapes: Shapes, objects: Sequence[str], fetched: float 
     frames = params.scenes.frames if params.data.source == "scenes" else USUAL_FRAMES
     pictures = len(objects) * kept_count(frames, params.frames) * 3 * params.frames.pixels**2
     parts = [f"embeddings {_round(total / GB)}" if rows else "embeddings and frames not known without the videos"]
-    total += PACKAGES + fetched + pictures + videos
+    bases = (
+        (params.encoder.weights, shapes.tower, 4),
+        (params.language.weights, shapes.llm, BYTES[params.language.dtype]),
+    )
+    own = sum(parameters(model) * each for folder, model, each in bases if model is not None and made(Path(folder)))
+    total += PACKAGES + fetched + pictures + videos + own
     parts += [f"frames {_round(pictures / GB)}, videos {_round(videos / GB)}"] if rows else []
     parts += [f"packages {_round(PACKAGES / GB)}", *([f"downloads {_round(fetched / GB)}"] if fetched else [])]
+    parts += [f"base models {_round(own / GB)}"] if own else []
     if shapes.llm is not None:
         connector, words, adapters = trained_parameters(params, shapes.llm, shapes.embedding)
         aligned, adapted = len({(v.encoder, v.opd, v.seed) for v in variants}), sum(v.lora == "with" for v in variants)
