@@ -7,8 +7,11 @@ import pytest
 from typer.testing import CliRunner
 
 from pipeline.cli import app
+from pipeline.cli.reproduce import right_answers
 from pipeline.config.params import load_params
+from pipeline.report.load import load_report
 from pipeline.scales import compose, write_params
+from pipeline.tasks import TASKS
 from tests.conftest import ROOT, moving_square, octopi, write_video
 from tests.report.conftest import rows_of
 
@@ -78,6 +81,27 @@ def test_a_dry_run_lists_what_waits_where_outputs_are_missing(project: Path, mon
     monkeypatch.setattr("dvc.cli.main", lambda _: pytest.fail("it ends where a file is missing"))
     monkeypatch.setattr("pipeline.cli.reproduce.outdated", lambda _: (["split", "grade"], 16, False))
     assert octopi("repro", "--dry").splitlines()[1:] == ["split", "grade"]
+
+
+def test_the_last_lines_are_those_of_the_reports_tables() -> None:
+    """The full system, not one that describes less; a model that was asked stands beside it; of random models none."""
+    file = ROOT / "reports" / "small-videos" / "scores.csv"
+    scores = load_report(file.parent).scores.query(
+        "seed == 'all' and measure in ['choice', 'combined'] and opd == 'all'"
+    )
+    said = "\n".join(right_answers(file, at_random=False))
+    for title, whose in (
+        ("octopi-small", "encoder == 'octopi-small' and touch == 'touch'"),
+        ("The full system", "encoder == 'finetuned' and lora == 'with' and touch == 'real'"),
+    ):
+        own = said.partition(f"{title}, with 95 % intervals:\n")[2]
+        for row, line in zip(
+            scores.query(whose).set_index("task").loc[[*TASKS][:5]].itertuples(), own.split("\n"), strict=False
+        ):
+            assert line.startswith(
+                f"  {TASKS[row.Index].title}: {100 * row.accuracy:.0f} % right [{100 * row.low:.0f}, "
+            )
+    assert "The full system" not in "\n".join(right_answers(file, at_random=True))
 
 
 def lines(output: str, severity: str) -> list[str]:

@@ -175,12 +175,13 @@ def check(
     folder: Annotated[Path, typer.Argument(help="Folder with the videos.")],
     catalogue: Annotated[Path | None, typer.Option(help="By default FOLDER/catalogue, or else PhysiCLeAR's.")] = None,
 ) -> None:
-    """List every file of a folder that is wrong or odd; status 1 where something must be mended."""
+    """List every file of a folder, or of its videos/ beside catalogue/, that is wrong or odd; status 1 for an error."""
     from pipeline.videos.audit.run import check_folder
     from pipeline.videos.catalogue import load_catalogue
 
-    own = folder / "catalogue"
+    own, videos = folder / "catalogue", folder / "videos"
     catalogue = catalogue or (own if own.is_dir() else PHYSICLEAR)
+    folder = videos if own.is_dir() and videos.is_dir() else folder
     _print_findings(check_folder(folder, load_catalogue(catalogue)))
 
 

@@ -17,10 +17,12 @@ from subprocess import run
 
 from pipeline.config.params import CHAIN, load_params
 from pipeline.core.runtime import cores
+from pipeline.evaluation.records import ADAPTED
 from pipeline.running.errors import UserError
 from pipeline.running.parallel import end_with_parent
 from pipeline.scales.cost import HOURS
 from pipeline.tasks import TASKS
+from pipeline.weights import is_random
 
 INTERRUPTED = ("exited with 130", "exited with -2")
 """How DVC's error ends for a stage that Ctrl-C ended, the second where it had hardly begun or was at its end."""
@@ -108,17 +110,23 @@ def _reproduce_one(name: str) -> int:
     return int(dvc(["--wait-for-lock", "repro", "--quiet", "--single-item", name]))
 
 
-def right_answers(file: Path, model: str | None) -> Iterator[str]:
-    """A line a task of scores.csv: what a trained model that was asked got right; without one, the full system."""
-    whose = (model, "", "touch") if model else ("finetuned", "with", "real")
+def right_answers(file: Path, at_random: bool) -> Iterator[str]:
+    """Lines of scores.csv: what trained models that were asked got right and, unless it is random, the full system."""
     with file.open(newline="", encoding="utf-8") as stream:
-        rows = [r for r in csv.DictReader(stream) if (r["encoder"], r["lora"], r["touch"]) == whose]
-    found = {r["task"]: r for r in rows if r["seed"] == "all" and r["measure"] in ("choice", "combined")}
-    for name in (task for task in TASKS if task in found):
-        row = {key: f"{100 * float(cell):.0f}" if cell else "" for key, cell in found[name].items() if key in SHOWN}
-        interval = f" [{row['low']}, {row['high']}]" if row["low"] else ""
-        chance = f", guessing {row['chance']}" if row["chance"] else ""
-        yield f"  {TASKS[name].title}: {row['accuracy']} % right{interval} of {found[name]['n']}{chance}"
+        rows = [r for r in csv.DictReader(stream) if r["seed"] == "all" and r["measure"] in ("choice", "combined")]
+    asked = dict.fromkeys(r["encoder"] for r in rows if r["touch"] == "touch" and ADAPTED not in r["encoder"])
+    whose = {name: (name, "", "all", "touch") for name in asked}
+    if not at_random:
+        whose["The full system"] = ("finetuned", "with", "all", "real")
+    for title, chosen in whose.items():
+        found = {r["task"]: r for r in rows if (r["encoder"], r["lora"], r["opd"], r["touch"]) == chosen}
+        if found:
+            yield f"{title}, with 95 % intervals:"
+        for name in (task for task in TASKS if task in found):
+            row = {key: f"{100 * float(cell):.0f}" if cell else "" for key, cell in found[name].items() if key in SHOWN}
+            interval = f" [{row['low']}, {row['high']}]" if row["low"] else ""
+            chance = f", guessing {row['chance']}" if row["chance"] else ""
+            yield f"  {TASKS[name].title}: {row['accuracy']} % right{interval} of {found[name]['n']}{chance}"
 
 
 def reproduce(root: Path, arguments: list[str]) -> int:
@@ -152,9 +160,10 @@ def reproduce(root: Path, arguments: list[str]) -> int:
         # Not on a GPU, nor where torch chooses how many threads a stage takes.
         runtime, ended = params.runtime, 0
         places = cores() // runtime.threads if runtime.threads and runtime.device == "cpu" and not arguments else 1
-        if min(places, len(waits)) > 1:
+        together = min(places, len(waits)) > 1
+        if together:
             ended = side_by_side(waits, places)
-        quiet = ["--quiet"] * (min(places, len(waits)) > 1)  # All has run: a line a stage would say so.
+        quiet = ["--quiet"] * together  # All has run: a line a stage would say so.
         ended = ended or int(dvc(["repro", *quiet, *arguments]))
         if stopped and isinstance(stopped[0], KeyboardInterrupt):
             raise KeyboardInterrupt
@@ -166,8 +175,8 @@ def reproduce(root: Path, arguments: list[str]) -> int:
         # A clone has the lock of a chain that ran elsewhere, so that DVC does not publish it; MLflow has nothing yet.
         attempt(params.tracking, publish, params)
     if (scores := root / "reports" / name / "scores.csv").is_file():
-        model = next(iter(params.evaluate.models), None)
-        print(f"{model or 'The full system'}, with 95 % intervals:", *right_answers(scores, model), sep="\n")
+        for line in right_answers(scores, any(map(is_random, (params.encoder.weights, params.language.weights)))):
+            print(line)
     print(f"Report: reports/{name}/README.md; all reports on one page: reports/index.html")
     print("Dashboard: make dashboard, then open the link to all variants that it prints after ten seconds")
     print('Ask the shipped model: octopi ask "Which is softer?" examples/soft.mp4 examples/hard.mp4')

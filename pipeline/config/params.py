@@ -116,7 +116,7 @@ def compose(name: str, overrides: Sequence[str] = (), conf: Path = CONF) -> Para
             texts[key.lstrip("+")] = value
         else:
             # Every key may be set; whether it exists is the validation's matter, since that knows what is allowed.
-            forced.append(override if key.startswith(("+", "~")) else f"++{override}")
+            forced.append(override if key.startswith("+") else f"++{override}")
     # A recipe brings its own values; they give way to what is set beside it.
     if (conf / "recipe" / f"{texts.get('encoder.recipe')}.yaml").is_file():
         forced.insert(0, f"recipe={texts['encoder.recipe']}")

@@ -68,7 +68,8 @@ def take(params: Params, file: Path, name: str) -> str:
         raise UserError(f"--name {name}: is a folder's name, too; write letters, digits, dots, hyphens")
     told: dict[str, Told] = {}
     try:
-        lines = file.read_text(encoding="utf-8").splitlines()
+        # Not splitlines, which also cuts at separators of Unicode that JSON may hold.
+        lines = file.read_text(encoding="utf-8").removesuffix("\n").split("\n")
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{file}: cannot be read ({error}); name a file of JSON lines with id and text") from None
     for number, line in enumerate(lines, 1):

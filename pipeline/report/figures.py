@@ -5,6 +5,7 @@ Drawn without pyplot (no global state, no window) and saved without dates, so th
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 
 import pandas as pd
@@ -136,7 +137,7 @@ def draw_maps(maps: pd.DataFrame, properties: Mapping[str, Sequence[str]]) -> Fi
     figure, places = _panels(len(properties) * len(columns), 2.6, 2.6, across=len(columns))
     panels = [(name, *column) for name in properties for column in columns]
     for number, (axes, (name, (method, encoder), rows)) in enumerate(zip(places, panels, strict=True)):
-        for level, color in zip(properties[name], SERIES, strict=False):
+        for level, color in zip(properties[name], itertools.cycle(SERIES), strict=False):
             own = rows[rows[name] == level]
             axes.plot(own["x"], own["y"], "o", color=color, markersize=3, alpha=0.8, label=level)
         axes.set(xticks=[], yticks=[], title=f"{method}, {encoder}" if number < len(columns) else "")

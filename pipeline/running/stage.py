@@ -66,7 +66,7 @@ class Stage:
 
         In a distributed training only the main process goes on from here: the others have nothing to write.
         """
-        if not _main_process():
+        if not main_process():
             sys.exit(0)
         self.metrics |= {m.name: m.value for m in history}
         self.metrics["steps"] = max((m.step for m in history), default=0)
@@ -150,8 +150,8 @@ def stage(name: str, key: str | None = None, *, launched: bool = False, of_varia
         running = Stage(full, params, started)
         limit_threads(params.runtime.threads)
         use_backend(params.runtime.parallel)
-        with alone(full) if _main_process() else nullcontext():
-            if _main_process():
+        with alone(full) if main_process() else nullcontext():
+            if main_process():
                 for folder in (DATA, RUNS, REPORTS, MODELS):
                     remove_rests(folder)
                 print(f"{full}: starts ({params.report_name})", flush=True)
@@ -223,13 +223,15 @@ def alone(name: str) -> Iterator[None]:
     """
     (RUNS / "locks").mkdir(parents=True, exist_ok=True)
     try:
-        with FileLock(RUNS / "locks" / f"{name}.lock", timeout=0):
+        # `running_stages` holds it for a moment, to look.
+        with FileLock(RUNS / "locks" / f"{name}.lock", timeout=1):
             yield
     except Timeout:
         raise UserError("is still running in another process; wait for it or stop it") from None
 
 
-def _main_process() -> bool:
+def main_process() -> bool:
+    """Whether this is the only process, or the first of a distributed training."""
     return os.environ.get("RANK", "0") == "0"
 
 

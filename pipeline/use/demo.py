@@ -30,10 +30,11 @@ from pipeline.scenes.light import make_sensor
 from pipeline.scenes.recipe import SceneRecipe, load_recipes
 from pipeline.scenes.render import make_scene, render
 from pipeline.tasks.opd import TEMPLATES
-from pipeline.use.results import Exchange, Pictures, Touch
+from pipeline.use.results import Exchange, Touch
 from pipeline.use.server import Failed, Worker, check_token, listen, make_server
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.film import write_film
+from pipeline.videos.frames.subtraction import Pictures
 
 if TYPE_CHECKING:
     from pipeline.use.model import Octopi
@@ -206,7 +207,7 @@ def make_app(session: Session, more: APIRouter | None = None, token: str = "") -
     @app.put("/api/touches/{name}")
     async def drop(name: str, request: Request) -> Any:
         """The body is the file itself."""
-        file = session.folder / uuid4().hex / (Path(name).name or "video")
+        file = session.folder / uuid4().hex / (Path(name).name.lstrip(".") or "video")
         file.parent.mkdir()
         try:
             with file.open("wb") as stream:

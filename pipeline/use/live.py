@@ -165,15 +165,11 @@ def run(model: Octopi, camera: str, question: str, say: Callable[[str], object],
                 notes = (*model.apart(said, heads), *model.notes([video], question))
                 said += f" (property heads: {heads.shown})" if heads else ""
             else:
-                found = model.describe(video)
-                known = found.probabilities
-                shares = {
-                    name: f" ({model.config.share(known[name][level])})"
-                    for name, level in found.levels.items()
-                    if name in known
-                }
-                levels = (f"{name} {level}{shares.get(name, '')}" for name, level in found.levels.items())
-                said, notes = "; ".join([*levels, found.sentence]), found.notes
+                found, told = model.describe(video), list[str]()
+                for name, level in found.levels.items():
+                    share = found.probabilities.get(name, {}).get(level)
+                    told.append(f"{name} {level}" + ("" if share is None else f" ({model.config.share(share)})"))
+                said, notes = "; ".join(filter(None, (*told, found.sentence))), found.notes
         except UserError as error:
             said, notes = str(error), ()
         say(f"press {number}, {len(press)} frames, {rate}: {said}")

@@ -49,7 +49,8 @@ def remember(folder: Path, touch: Remembered) -> int:
     """
     if not touch.name.strip():
         raise UserError("the name is empty; call the object something")
-    touches = recall(folder, touch.encoder) if (folder / TOUCHES).exists() else []
+    file = folder / TOUCHES
+    touches = recall(folder, touch.encoder) if file.exists() and file.stat().st_size else []
     write_jsonl(folder / TOUCHES, [*touches, touch])
     return len(touches) + 1
 
@@ -60,9 +61,9 @@ def recall(folder: Path, encoder: str) -> list[Remembered]:
     Raises:
         UserError: where there is no memory, its file is broken, or another encoder wrote it.
     """
-    if not (folder / TOUCHES).is_file():
+    touches = read_jsonl(folder / TOUCHES, Remembered) if (folder / TOUCHES).is_file() else []
+    if not touches:
         raise UserError(f"{folder}: no memory of touches; `octopi remember NAME VIDEO --memory {folder}` begins one")
-    touches = read_jsonl(folder / TOUCHES, Remembered)
     if any(touch.encoder != encoder for touch in touches):
         raise UserError(f"{folder / TOUCHES}: another encoder's; remember its touches anew, in another folder")
     return touches

@@ -11,7 +11,7 @@ import re
 import shutil
 import time
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import zip_longest
 from pathlib import Path
 
@@ -37,7 +37,7 @@ class RatedFolder:
 
     def __init__(self, folder: Path, properties: Path) -> None:
         """Open a folder, or make one with the properties of the file `properties`; UserError for a broken one."""
-        self.videos, self.catalogue, self.sessions = folder / "videos", folder / "catalogue", dict[str, str]()
+        self.videos, self.catalogue, self.known = folder / "videos", folder / "catalogue", dict[str, Recorded]()
         self.videos.mkdir(parents=True, exist_ok=True)
         file = self.catalogue / PROPERTIES
         if not file.exists():  # `dataset` would put PhysiCLeAR's figures beside other videos'.
@@ -100,20 +100,28 @@ class RatedFolder:
         row |= {"object_id": object_id, "rater": rater, property: str(level)}
         self.save(rows)
 
-    def rename(self, old: str, new: str, name: str) -> str:
-        """Give an object another id and name, with its videos and ratings; the name that it had."""
+    def rename(
+        self, old: str, new: str, name: str, files: Mapping[str, str] | None = None
+    ) -> tuple[str, dict[str, str]]:
+        """Give an object another id and name, with its videos and ratings.
+
+        Args:
+            files: For an undo, what each of its videos was called.
+
+        Returns:
+            The name that it had, and what each of its videos was called, by what it is called now.
+        """
         rows, videos, lines = self.ratings(), self.recorded(), self._read(OBJECTS, ["object_id", "name"])
         if new in {row["object_id"] for row in rows} | {video.object_id for video in videos}:
             raise UserError(f"{new}: is another object; give the videos to it one by one")
-        for video in videos:
-            if video.object_id == old:
-                self.move(video.file, new)
+        own = [video.file for video in videos if video.object_id == old]
+        moved = {self.move(file, new, (files or {}).get(file, ""))[0]: file for file in own}
         names = {line["object_id"]: line["name"] for line in lines}
         lines = [line | {"object_id": new, "name": name} if line["object_id"] == old else line for line in lines]
         if lines:
             self._write(OBJECTS, lines[0], lines)
         self.save([row | {"object_id": new} if row["object_id"] == old else row for row in rows])
-        return names.get(old, old.replace("_", " "))
+        return names.get(old, old.replace("_", " ")), moved
 
     def agreement(self) -> dict[str, tuple[float, float, float] | None]:
         """By property ICC(3,k) with its interval, over the objects that every rater rated; None where undefined."""
@@ -145,8 +153,10 @@ class RatedFolder:
             if row["file"] in there:
                 found[row["file"]] = Recorded(**{key: row.get(key, "") for key in Recorded.model_fields})
         for name, path in there.items():
-            if name not in found and (match := re.fullmatch(r"([\w-]+)_\d+", path.stem)):
-                found[name] = Recorded(file=name, object_id=match[1], session=self.sessions.get(name, ""))
+            if name not in found and name in self.known:
+                found[name] = self.known[name]
+            elif name not in found and (match := re.fullmatch(r"([\w-]+)_\d+", path.stem)):
+                found[name] = Recorded(file=name, object_id=match[1], session="")
         return list(found.values())
 
     def list_videos(self) -> None:
@@ -156,19 +166,23 @@ class RatedFolder:
         else:
             (self.videos / LIST_FILE).unlink(missing_ok=True)
 
-    def move(self, file: str, to: str) -> tuple[str, str]:
-        """Give a video to another object, or with an empty `to` put it aside; where it is now, and whose it was."""
-        row = next((row for row in self.recorded() if row.file == file), None)
-        if row is None and file not in self.sessions:
-            raise UserError(f"{file}: no such video; load the page anew")
+    def move(self, file: str, to: str, now: str = "") -> tuple[str, str]:
+        """Give a video to another object, or with an empty `to` put it aside; where it is now, and whose it was.
+
+        Args:
+            now: For an undo, what it was called; by default the next free number of the object.
+        """
+        row = next((row for row in self.recorded() if row.file == file), self.known.get(file))
         source = self.videos / file
+        if row is None or not source.is_file():
+            raise UserError(f"{file}: no such video; load the page anew")
         free = f"{to}_{first_free(self.videos, to)}{source.suffix}"
-        now = free if to else f"{ASIDE}/{time.time_ns()}_{source.name}"
-        self.sessions[now] = row.session if row else self.sessions[file]
+        now = now or (free if to else f"{ASIDE}/{time.time_ns()}_{source.name}")
+        self.known[now] = Recorded(file=now, object_id=to, session=row.session)
         target = self.videos / now
-        target.parent.mkdir(exist_ok=True)
+        target.parent.mkdir(parents=True, exist_ok=True)
         for suffix in (".csv", source.suffix):  # The times first, so that no video is without them.
             if source.with_suffix(suffix).is_file():
                 os.replace(source.with_suffix(suffix), target.with_suffix(suffix))
         self.list_videos()
-        return now, row.object_id if row else ""
+        return now, row.object_id

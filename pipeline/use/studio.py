@@ -33,7 +33,7 @@ from pipeline.videos.catalogue import PROPERTIES, load_catalogue
 from pipeline.videos.decoding import Image
 from pipeline.videos.frames.reference import LONGEST, contact_strength, is_steady, mean
 from pipeline.videos.frames.subtraction import subtract
-from pipeline.videos.importing.presses import RELEASED, SHORTEST, Shot, cut
+from pipeline.videos.importing.presses import RELEASED, SHORTEST, Recorded, Shot, cut
 
 if TYPE_CHECKING:
     from pipeline.use.model import Octopi
@@ -200,7 +200,8 @@ class Studio(Session):
             try:
                 with self.lock:
                     (path,) = cut(lambda: iter(press), self.sensor.camera, self.data.videos, target, whole=True)
-                    file, self.data.sessions[path.name] = path.name, self.session
+                    file = path.name
+                    self.data.known[file] = Recorded(file=file, object_id=target, session=self.session)
                     self.data.list_videos()
                     self.undos.append(lambda: self.data.move(file, ""))
                 said = ": ".join(filter(None, (file, odd)))
@@ -221,14 +222,14 @@ class Studio(Session):
         """Give a video to another object; with an empty name delete it."""
         with self.lock:
             now, whose = self.data.move(file, self.data.id_of(name) if name else "")
-            self.undos.append(lambda: self.data.move(now, whose))
+            self.undos.append(lambda: self.data.move(now, whose, file))
 
     def rename(self, object_id: Text, name: Text) -> None:
         """Call an object otherwise."""
         with self.lock:
             new = self.data.id_of(name)
-            old = self.data.rename(object_id, new, name)
-            self.undos.append(lambda: self.data.rename(new, object_id, old))
+            old, files = self.data.rename(object_id, new, name)
+            self.undos.append(lambda: self.data.rename(new, object_id, old, files))
             self.target = new if self.target == object_id else self.target
 
     def undo(self) -> None:
@@ -248,7 +249,7 @@ class Studio(Session):
         """What is in the folder, and one rater's ratings; those of all only for who has rated every object."""
         rows, videos = self.data.ratings(), self.data.recorded()
         own = [row for row in rows if row["rater"] == rater]
-        blind = bool(rater) and sum(all(row.values()) for row in own) < len(
+        blind = sum(all(row.values()) for row in own) < len(
             {row["object_id"] for row in rows} | {video.object_id for video in videos} - {"unknown"}
         )
         return {

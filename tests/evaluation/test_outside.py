@@ -34,7 +34,10 @@ def test_right_answers_are_right_and_no_answer_leaves(tmp_path: Path, monkeypatc
         assert sum(turn.count("{tactile}") for turn in row["turns"]) == len(row["videos"])
         assert not any(turn.assistant in json.dumps(row) for turn in dialogue.turns)
         told.append({"id": row["id"], "text": dialogue.turns[-1].assistant})
-    Path("told.jsonl").write_text("\n".join(map(json.dumps, told)))
+    # As other writers have it: a separator of Unicode stands for itself, and ends no line.
+    told[0]["text"] = "Well.\u2028" + told[0]["text"]
+    rows = [json.dumps(row, ensure_ascii=False) for row in told]
+    Path("told.jsonl").write_text("\n".join(rows), encoding="utf-8")
     assert f"{len(built)} answers" in octopi("questions", "grade", "told.jsonl", "--name", "their-model")
     for stage in ("grade", "report"):
         runpy.run_path(str(ROOT / "stages" / f"{stage}.py"), run_name="__main__")

@@ -111,6 +111,7 @@ def test_what_is_wrong_comes_back_as_one_line(site: str, tmp_path: Path) -> None
     asked = {"question": "{tactile}?", "touches": []}
     for place, body, told in (
         ("touches/a.mp4", {}, "a.mp4: empty (0 bytes); copy it again, or remove it"),
+        ("touches/%2e%2e", {"content": b"no video"}, "video: "),
         ("touches/..%5C..%5Ca.mp4", {"content": b"no video"}, "no frame decodes"),
         ("ask", {"json": asked}, "the question has 1 {tactile} for 0 videos"),
         ("ask", {"json": {**asked, "touches": ["0"]}}, "1 touches are forgotten; begin a new conversation"),

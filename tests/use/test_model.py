@@ -319,6 +319,10 @@ def test_what_is_no_memory_is_refused_and_stays(octopi: Octopi, files: list[Path
     memory = tmp_path / "touches"
     with refused("no memory of touches; `octopi remember"):
         octopi.recognise(files[0], memory)
+    memory.mkdir()
+    (memory / TOUCHES).touch()
+    with refused("no memory of touches; `octopi remember"):
+        octopi.recognise(files[0], memory)
     octopi.remember("my ice", files[0], memory)
     written = (memory / TOUCHES).read_text()
     still = np.full((20, 64, 64, 3), 90, np.uint8)

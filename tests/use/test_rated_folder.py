@@ -1,11 +1,19 @@
 """The folder that the studio fills: read by the catalogue's own reader, and nothing is lost on the way."""
 
+import threading
+from contextlib import suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from pipeline.config.params import compose
 from pipeline.core.io import read_csv, read_json
+from pipeline.running.errors import UserError
 from pipeline.scales import check_inputs
 from pipeline.use.rated_folder import RatedFolder
+from pipeline.use.studio import Studio
 from pipeline.videos.audit.labels import icc3k
 from pipeline.videos.audit.run import check_folder
 from pipeline.videos.catalogue import load_catalogue
@@ -80,7 +88,7 @@ def test_a_folder_written_by_hand_stays_as_it_is(tmp_path: Path) -> None:
     assert [row["rater"] for row in data.ratings()] == ["rater 1", "rater 2", "rater 1"]
     assert data.id_of("A block of foam") == "foam"
     rate(data, "ann", "glass")
-    assert data.rename("glass", "pane", "a big pane, of glass") == "a pane of glass"
+    assert data.rename("glass", "pane", "a big pane, of glass") == ("a pane of glass", {"pane_0.mp4": "glass_0.mp4"})
     found = load_catalogue(catalogue).objects["pane"]
     assert (found.name, found.ratings[0]) == ("a big pane, of glass", (2, 0))
     assert found.splits == before.objects["glass"].splits
@@ -116,3 +124,35 @@ def test_videos_move_come_back_and_survive_a_kill(tmp_path: Path) -> None:
     assert [row.file for row in opened(tmp_path).recorded()] == ["foam_1.mp4", "foam_7.mp4"]
     assert [row.file for row in read_csv(listed, Recorded)] == ["foam_1.mp4", "foam_7.mp4"]
     assert not rest.exists()
+
+
+@settings(max_examples=40)
+@given(st.lists(st.tuples(st.sampled_from(["press", "give", "delete", "rename"]), st.integers(0, 4)), max_size=8))
+def test_undo_gives_back_what_was_step_by_step(steps: list[tuple[str, int]]) -> None:
+    with TemporaryDirectory() as folder:
+        data, desk = RatedFolder(Path(folder), PROPERTIES), Studio.__new__(Studio)
+        desk.data, desk.lock, desk.undos, desk.target = data, threading.RLock(), [], ""
+
+        def shown() -> list[tuple[str, str, bytes]]:
+            return sorted((r.file, r.object_id, (data.videos / r.file).read_bytes()) for r in data.recorded())
+
+        (data.videos / "first try.mp4").write_bytes(b"first")
+        (data.videos / "videos.csv").write_text("file,object_id,session\nfirst try.mp4,foam,monday\n")
+        before = [shown()]
+        for place, (kind, number) in enumerate(steps):
+            name, videos = f"object {number}", data.recorded()
+            row = videos[number % len(videos)] if videos else None
+            if kind == "press":
+                file = f"foam_{100 + place}.mp4"
+                (data.videos / file).write_bytes(bytes([place]))
+                desk.undos.append(lambda file=file: data.move(file, ""))  # type: ignore[misc]
+            elif row and kind == "rename":
+                with suppress(UserError):  # To the name of another object.
+                    desk.rename(row.object_id, name)
+            elif row:
+                desk.move(row.file, name if kind == "give" else "")
+            before += [shown()] * (len(desk.undos) - len(before) + 1)
+        while desk.undos:
+            assert shown() == before.pop()
+            desk.undo()
+        assert shown() == before.pop()

@@ -302,6 +302,14 @@ def test_a_table_says_where_to_cut(tmp_path: Path, pictures: list[np.ndarray], c
     assert sessions == [("felt_0.mp4", "two"), ("rug_0.mp4", "one"), ("rug_1.mp4", "two")]
     (found,) = (f for f in list_videos(tmp_path, catalogue).findings if f.severity is Severity.ERROR)
     assert f"octopi import video {table} --out" in found.measured, "the chain would take the whole file"
-    table.write_text("file,object_id,begin\nlong.mp4,rug,inf\n")
-    with refused("line 2: begin is 'inf'"):
-        octopi("import", "video", table, "--out", out)
+    table.write_text("file,object_id\nlong.mp4,rug\n")
+    octopi("import", "video", table, "--out", out)
+    listed = [f.relative for f in list_videos(out, catalogue).files]
+    assert listed == ["rug_0.mp4", "rug_1.mp4", "rug_2.mp4"], "what the list had, and what it has now"
+    for cells, told in (("rug,inf", "line 3: begin is 'inf'"), ("a rug,0", "line 2: object 'a rug': take letters")):
+        table.write_text(f"file,object_id,begin\nlong.mp4,{'rug,1' if 'inf' in cells else cells}\nlong.mp4,{cells}\n")
+        with refused(told):
+            octopi("import", "video", table, "--out", out)
+    with refused("names sections of files, and would be lost; name another --out"):
+        octopi("import", "video", table, "--out", tmp_path)
+    assert len([*out.glob("*.mp4")]) == 4, "nothing is written where a line is wrong"

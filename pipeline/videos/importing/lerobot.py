@@ -119,7 +119,8 @@ def read_episodes(root: Path, key: str) -> list[Episode]:
                 rows += pd.read_parquet(file, columns=columns).to_dict("records")
         else:
             file = root / "meta/episodes.jsonl"
-            rows += map(json.loads, file.read_text(encoding="utf-8").splitlines())
+            with file.open(encoding="utf-8") as stream:
+                rows += map(json.loads, stream)
         if len(rows) != total:
             raise UserError(f"{root}/meta: {len(rows)} of {total} episodes are listed; {AGAIN}")
         for row in sorted(rows, key=lambda row: row["episode_index"]):

@@ -117,7 +117,7 @@ def cut(
         UserError: if the recording cannot be read, or nothing touches the sensor.
     """
     if re.fullmatch(r"[\w-]+", object_id) is None:
-        raise UserError(f"--object {object_id!r}: take letters, digits, _ and -, as in objects.csv")
+        raise UserError(f"{name}: object {object_id!r}: take letters, digits, _ and -, as in objects.csv")
     stamped, received, strengths = _measure(read())
     if len(received) < SHORTEST:
         raise NothingTouchesError(
@@ -164,21 +164,32 @@ def first_free(out: Path, object_id: str) -> int:
 def cut_listed(listed: Path, out: Path, fps: float = 0.0) -> list[Path]:
     """Write what each line of a table names as one video, with a `videos.csv` beside them where sessions are known.
 
+    A list that is there already goes on, as a folder with a list has its files alone.
+
     Args:
         listed: CSV with the columns `file` (from the table's folder), `object_id`, and, where wanted, `begin` and `end`
             in seconds (empty: from the beginning, to the end) and `session`. One file may stand in many lines.
         fps: As `film`'s.
+
+    Raises:
+        UserError: as of `cut`, or where the folder's list is a table of sections.
     """
     header, rows = read_rows(listed, ("file", "object_id"))
-    written, sessions = list[Path](), list[Recorded]()
-    for where, row in rows:
-        begin, end = (_seconds(where, column, row.get(column, "")) for column in SECTION)
+    before, known = read_rows(out / LIST_FILE, ("file", "object_id")) if (out / LIST_FILE).is_file() else ([], [])
+    if {*SECTION} & {*before}:
+        raise UserError(f"{out / LIST_FILE}: names sections of files, and would be lost; name another --out")
+    sections = [[_seconds(where, column, row.get(column, "")) for column in SECTION] for where, row in rows]
+    written, sessions = list[Path](), [row for _, row in known]
+    for (where, row), (begin, end) in zip(rows, sections, strict=True):
         read = partial(film, listed.parent / row["file"], fps, begin or 0.0, end)
         (path,) = cut(read, where, out, row["object_id"], whole=True)
         written.append(path)
-        sessions.append(Recorded(file=path.name, object_id=row["object_id"], session=row.get("session", "")))
-    if "session" in header:
-        write_csv(out / LIST_FILE, Recorded, sessions)
+        sessions.append({"session": "", **row, "file": path.name})
+    if known or "session" in header:
+        fields = Recorded.model_fields
+        write_csv(
+            out / LIST_FILE, Recorded, [Recorded(**{key: row.get(key, "") for key in fields}) for row in sessions]
+        )
     return written
 
 
