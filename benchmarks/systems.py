@@ -55,7 +55,7 @@ def measure(root: Path, triples: int = 12, batch: int = 32) -> list[Row]:
         baseline=MODEL,
         errors={
             name: Error(
-                fmean(e.value for e in es),
+                fmean(e.error for e in es),
                 fmean(e.low or 0.0 for e in es),
                 fmean(1.0 if e.high is None else e.high for e in es),
                 sum(e.n or 0 for e in es),

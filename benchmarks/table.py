@@ -41,7 +41,7 @@ def machine(threads: str) -> str:
 class Error:
     """An error, and the ends of its interval where there are objects enough."""
 
-    value: float
+    error: float
     low: float | None = None
     high: float | None = None
     n: int | None = None
@@ -52,12 +52,6 @@ class Error:
         """1 - accuracy of a row of scores.csv."""
         low, high = (None if end is None else 1 - end for end in (score.high, score.low))
         return cls(1 - score.accuracy, low, high, score.n)
-
-    @property
-    def columns(self) -> dict[str, float]:
-        """As a row of the table names them."""
-        columns = {"error": self.value, "low": self.low, "high": self.high, "n": self.n}
-        return {name: value for name, value in columns.items() if value is not None}
 
 
 def share_of(wrong: Sequence[float] | np.ndarray, objects: Sequence[tuple[str, ...]]) -> Error:
@@ -136,7 +130,7 @@ def make_rows(
         ratio = median(c / b for c, b in zip(own, costs[baseline], strict=True))
         values = {"cost": median(own), "cost_ratio": ratio, **counts.get(name, {})}
         if name in errors:
-            values |= errors[name].columns
+            values |= {column: value for column, value in vars(errors[name]).items() if value is not None}
         rounded = {column: float(f"{value:.4g}") for column, value in values.items()}
         named = {"question": question, "setting": name, "unit": unit, "machine": machine}
         rows.append(Row.model_validate({**named, "error_of": error_of if errors else "", **rounded}))

@@ -13,7 +13,6 @@ from pipeline.running.parallel import device_here
 from pipeline.running.stage import Stage, stage
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.records import Assignment
-from pipeline.weights.backbones import check_encoder
 
 
 def embed(run: Stage, videos: Sequence[Assignment], state: Path | None) -> tuple[torch.Tensor, list[Embedding]]:
@@ -44,7 +43,6 @@ if __name__ == "__main__":
         from pipeline.training.embeddings import STATISTICS_FILE
 
         params = run.params
-        check_encoder(Path(params.encoder.weights), params.frames.pixels, params.encoder.backbone)
         splits = {seed: read_table(split_file(seed), Assignment) for seed in params.ablation.seeds}
         for which in params.ablation.encoders:
             if which is Encoder.BASE:

@@ -49,24 +49,34 @@ def rescale(probabilities: npt.ArrayLike, temperature: float) -> Floats:
 
 
 def fit_temperature(classified: Sequence[Classification]) -> float:
-    """The temperature that makes the expected classes of one property likeliest; 1 where there are none to fit it on.
+    """The temperature of one property, from videos that nothing was trained on; 1 where there are none."""
+    if not classified:
+        return 1.0
+    probabilities, expected, objects = zip(
+        *((c.probabilities, c.expected, c.object_id) for c in classified), strict=True
+    )
+    return likeliest_temperature(probabilities, expected, objects)
 
-    It is fitted on videos that nothing was trained on. Those of one object are alike, so each object counts once, by
-    its videos' mean. With few objects the data say little, so the temperature's logarithm has a normal prior of mean 0
-    and deviation log(`PRIOR`).
+
+def likeliest_temperature(probabilities: npt.ArrayLike, expected: npt.ArrayLike, objects: Sequence[str]) -> float:
+    """The temperature that makes the expected classes of one property likeliest.
+
+    Videos of one object are alike, so each object counts once, by its videos' mean. With few objects the data say
+    little, so the temperature's logarithm has a normal prior of mean 0 and deviation log(`PRIOR`).
+
+    Args:
+        probabilities: Videos x classes.
+        expected: The class of each video.
+        objects: The object of each video.
     """
     from scipy.optimize import minimize_scalar
 
-    if not classified:
-        return 1.0
-    probabilities = np.array([c.probabilities for c in classified])
-    expected = np.array([c.expected for c in classified])
-    objects = Counter(c.object_id for c in classified)
-    weights = np.array([1 / objects[c.object_id] for c in classified])
+    counts, wanted = Counter(objects), np.asarray(expected)
+    weights = np.array([1 / counts[name] for name in objects])
 
     def loss(log_temperature: float) -> float:
         scaled = rescale(probabilities, float(np.exp(log_temperature)))
-        missed = -np.log(np.maximum(scaled[np.arange(len(expected)), expected], SMALLEST))
+        missed = -np.log(np.maximum(scaled[np.arange(len(wanted)), wanted], SMALLEST))
         return float(weights @ missed) + (log_temperature / math.log(PRIOR)) ** 2 / 2
 
     # Over the logarithm, in which halving and doubling a temperature are equally far.

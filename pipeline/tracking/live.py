@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from pipeline.running.stage import Stage
+from pipeline.running.stage import Stage, main_process
 from pipeline.tracking.chain import axes, read_stages, settings
 from pipeline.tracking.store import PARENT, STAGE, Store, attempt
 
@@ -22,8 +21,7 @@ def live(run: Stage) -> Iterator[list[Any]]:
         first process of a distributed training, and where tracking is out of reach.
     """
     tracking = run.params.tracking
-    first = os.environ.get("RANK", "0") == "0"
-    begun = attempt(tracking, _begin, run) if tracking.live and first else None
+    begun = attempt(tracking, _begin, run) if tracking.live and main_process() else None
     if begun is None:
         yield []
         return

@@ -51,9 +51,6 @@ class EmbeddingStore:
 
     Args:
         folder: Where `embed` wrote them; without a folder the store is empty.
-
-    Raises:
-        UserError: naming the video, where an embedding is not finite: it would spoil all that is trained on it.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
@@ -64,14 +61,7 @@ class EmbeddingStore:
             return
         self.folder = folder
         self.tensor = load_tensors(folder / TENSOR_FILE)[TENSOR]
-        # In parts: one boolean for every value would take a quarter of the embeddings' own memory.
-        finite = [ok for part in self.tensor.split(2**16) for ok in part.isfinite().all(1).tolist()]
         for entry in read_table(folder / INDEX_FILE, Embedding):
-            if not finite[entry.row]:
-                raise UserError(
-                    f"{folder / TENSOR_FILE}: {entry.video_id} has an embedding that is not finite (frame "
-                    f"{entry.frame_index}); check the video and the encoder, then run `dvc repro embed -f`"
-                )
             self._rows[entry.video_id, entry.flip].append(entry.row)
 
     @property

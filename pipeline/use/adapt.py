@@ -13,10 +13,10 @@ import numpy as np
 import torch
 
 from pipeline.core.io import atomic_folder, load_tensors, save_tensors, sha256, write_json, write_text
-from pipeline.core.records import Encoder, Part
+from pipeline.core.records import Encoder
+from pipeline.encoder.embed import standardize
 from pipeline.encoder.frame_classifier import FittedHeads, JointFrameClassifier
-from pipeline.encoder.records import Classification
-from pipeline.evaluation.calibration import fit_temperature
+from pipeline.evaluation.calibration import likeliest_temperature
 from pipeline.evaluation.intervals import accuracy_interval
 from pipeline.running.errors import UserError, counted
 from pipeline.running.progress import track
@@ -46,8 +46,6 @@ class Adapted(NamedTuple):
     changed: dict[str, torch.Tensor]
     """Tensors of the property heads, in place of the old ones; empty where they stay."""
     statistics: Statistics
-    features: torch.Tensor
-    """Frames as the language model is given them."""
     told: str
     """What a reader should know of it."""
     temperatures: dict[str, float]
@@ -118,9 +116,8 @@ def adapt(
     made = _without_ratings(model, encoded) if catalogue is None else _rated(model, encoded, catalogue, objects, seed)
     update: dict[str, Any] = {"scores": {}, "temperatures": made.temperatures or config.temperatures}
     update["trained_on"] = FITTED if catalogue is None and not config.calibrated else "videos"
-    lengths = [len(video.raw) for video in encoded]
     # Rounded up to the digits that config.json keeps, so that the farthest video itself is not flagged.
-    farthest = max(distance(part.double().numpy()) for part in made.features.split(lengths))
+    farthest = max(distance(standardize(video.raw, made.statistics).double().numpy()) for video in encoded)
     update["usual"] = math.ceil(1e4 * farthest) / 1e4
     if catalogue is not None:
         same = [*catalogue.classes.items()] == [*model.catalogue.classes.items()]
@@ -142,24 +139,21 @@ def adapt(
 
 def _without_ratings(model: Octopi, encoded: Sequence[EncodedVideo]) -> Adapted:
     """Standardise what the language model reads, and the heads' logits, by these videos."""
-    known, classifier = model.encoder.statistics, model.encoder.classifier
-    features, changed = torch.cat([video.features for video in encoded]).double(), {}
-    told = f"Its embeddings are standardised by {counted(len(encoded), 'video')}, without a label."
-    statistics = known
+    statistics, classifier = model.encoder.statistics, model.encoder.classifier
+    told, changed = f"Its embeddings are standardised by {counted(len(encoded), 'video')}, without a label.", {}
     if model.config.encoder.standardize:
-        std, mean = torch.std_mean(features, dim=0, correction=0)
-        # A dimension that is constant in these frames gives no estimate of its scale, so the old scale stays.
-        scale = known.scale * torch.where(std > 0, std, 1.0)
-        # The features are standardised already, so the new mean and deviation come on top of the old ones.
-        statistics = known._replace(mean=known.mean + mean * known.scale, scale=scale)
-        features = (features - mean) / torch.where(std > 0, std, 1.0)
+        std, mean = torch.std_mean(torch.cat([video.features for video in encoded]).double(), dim=0, correction=0)
+        # The features are standardised already, so the new mean and deviation come on top of the old ones. A dimension
+        # that is constant in these frames gives no estimate of its scale, so the old scale stays.
+        mean, scale = statistics.mean + mean * statistics.scale, statistics.scale * torch.where(std > 0, std, 1.0)
+        statistics = statistics._replace(mean=mean, scale=scale)
     if isinstance(classifier, JointFrameClassifier) and model.config.encoder_used is Encoder.FINETUNED:
         clips, linear = _clips(encoded), _linear(model)
         # Which classes occur together among the objects of its training says nothing of other objects.
         found = on_features(standardised(linear, clips), clips, classifier.classes, np.zeros(classifier.classes))
         changed = _tensors(found)
         told += " So are the logits of its property heads. It was tested on nothing."
-    return Adapted(changed, statistics, features, told, {})
+    return Adapted(changed, statistics, told, {})
 
 
 def _rated(
@@ -168,43 +162,24 @@ def _rated(
     """Read the heads anew, and test them on objects that were held out."""
     levels = [len(p.levels) for p in catalogue.properties]
     same = [*catalogue.classes.items()] == [*model.catalogue.classes.items()]
-    clips, labels = _clips(encoded), np.array([catalogue.labels(o) for o in objects])
-    read = read_anew(Rated(clips, labels, np.array(objects)), levels, Known(_linear(model), same), seed)
-    statistics = model.encoder.statistics
-    if statistics.heads is not None:
-        logits = torch.from_numpy(read.logits)
+    labels = np.array([catalogue.labels(o) for o in objects])
+    read = read_anew(Rated(_clips(encoded), labels, np.array(objects)), levels, Known(_linear(model), same), seed)
+    if model.encoder.statistics.heads is None:
+        statistics = _without_ratings(model, encoded).statistics
+    else:
         # Of objects that the heads did not see, as all later ones are: of their own they are too sure.
-        std, mean = torch.std_mean(logits, dim=0, correction=0)
+        std, mean = torch.std_mean(torch.from_numpy(read.logits), dim=0, correction=0)
         weights, biases = map(torch.from_numpy, read.heads.linear())
         scale = torch.where(std > 0, std, 1.0)
-        statistics = statistics._replace(mean=mean, scale=scale, heads=(weights, biases))
-        features = (torch.from_numpy(clips).flatten(0, 1).double() @ weights.T + biases - mean) / scale
-    else:
-        plain = _without_ratings(model, encoded)
-        statistics, features = plain.statistics, plain.features
+        statistics = model.encoder.statistics._replace(mean=mean, scale=scale, heads=(weights, biases))
     temperatures = {
-        p.name: fit_temperature(
-            [
-                Classification(
-                    video_id=video.name,
-                    object_id=own,
-                    part=Part.VALIDATION,
-                    property=p.name,
-                    expected=expected,
-                    predicted=int(table.argmax()),
-                    probabilities=tuple(np.exp(table).tolist()),
-                )
-                for video, own, expected, table in zip(
-                    encoded, objects, labels[:, place].tolist(), read.evidence[place], strict=True
-                )
-            ]
-        )
-        for place, p in enumerate(catalogue.properties)
+        p.name: likeliest_temperature(np.exp(table), labels[:, place], objects)
+        for place, (p, table) in enumerate(zip(catalogue.properties, read.evidence, strict=True))
     }
     told = _expected(read, labels, objects, catalogue.classes)
     if not same:
         told += "\nIts language model knows other properties, and is not asked; heads alone answer."
-    return Adapted(_tensors(read.heads), statistics, features, told, temperatures)
+    return Adapted(_tensors(read.heads), statistics, told, temperatures)
 
 
 def _expected(read: Reading, labels: np.ndarray, objects: Sequence[str], classes: dict[str, tuple[str, ...]]) -> str:

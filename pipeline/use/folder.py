@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import json
 import logging
+import platform
 from collections.abc import Mapping
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -131,6 +133,14 @@ class ModelConfig(Record):
         return fingerprint(json.dumps(told, sort_keys=True))
 
 
+def provenance(folder: Path) -> dict[str, Any]:
+    """What config.json says of a folder whose other files are there: its format, their hashes, and versions."""
+    files = {f.relative_to(folder).as_posix(): sha256(f) for f in sorted(folder.rglob("*")) if f.is_file()}
+    versions = {name: metadata.version(name) for name in LIBRARIES}
+    python = ".".join(platform.python_version_tuple()[:2])
+    return {"format": FORMAT, "files": files, "versions": {"python": python, **versions}}
+
+
 def read_folder(folder: Path) -> tuple[ModelConfig, Catalogue]:
     """What a folder says of itself; its files are compared with their hashes.
 
@@ -146,8 +156,6 @@ def read_folder(folder: Path) -> tuple[ModelConfig, Catalogue]:
             f"{folder / CONFIG}: of format {version}, but this version reads {FORMAT}; run `dvc repro package` again, "
             "or install the version that made it"
         )
-    if isinstance(language := values.get("language"), dict):
-        language.pop("touch_noise", None)  # A removed setting; folders that still have it have it off.
     config = _validate(ModelConfig, values, folder / CONFIG)
     for name, expected in config.files.items():
         file = folder / name

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 NUMBERED = re.compile(r"object \d+")
 ALONE = "the question compares, but there is one video: what it says of another is made up"
 APART = "the sentence and the property heads disagree; heads alone are right more often (the card has both)"
+UNTOLD = "this variant was not trained to describe, so there is no sentence"
 MUTE = "its language model knows other properties and is not asked; property heads alone answer"
 RANDOM = "its base models are tiny and random, made to test the chain: no answer of it means anything"
 
@@ -265,13 +266,7 @@ class Octopi:
         videos = _listed(videos)
         described, asked = [], []
         heads, tells = self.config.heads, self.config.opd is not Opd.NONE and self.config.speaks
-        doubts: tuple[str, ...] = ()
-        if not tells:
-            doubts = (
-                ("this variant was not trained to describe, so there is no sentence",)
-                if self.config.speaks
-                else (MUTE,)
-            )
+        doubts: tuple[str, ...] = () if tells else (UNTOLD if self.config.speaks else MUTE,)
         doubts += () if heads else ("it has no property heads; its classes are those that its sentence names",)
         for video in videos:  # All of a video at once, as not all may be remembered.
             encoded, classified = self.encoder.encode(video), self.encoder.classify(video) if heads else Classified()

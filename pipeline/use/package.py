@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import platform
 import shutil
 from collections.abc import Mapping, Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +12,7 @@ from huggingface_hub import EvalResult
 
 from pipeline.config import LANGUAGE_DIR, Params
 from pipeline.core import layout
-from pipeline.core.io import atomic_folder, read_json, read_jsonl, read_table, save_tensors, sha256, write_json
+from pipeline.core.io import atomic_folder, read_json, read_jsonl, read_table, save_tensors, write_json
 from pipeline.core.records import Encoder, Lora, Part, Question, TouchInput, Variant
 from pipeline.encoder.records import Classification
 from pipeline.evaluation.calibration import calibration_rows, fit_temperature
@@ -35,8 +33,6 @@ from pipeline.use.folder import (
     CATALOGUE,
     CONFIG,
     ENCODER_DIR,
-    FORMAT,
-    LIBRARIES,
     SCENES,
     TRAINED,
     Base,
@@ -44,6 +40,7 @@ from pipeline.use.folder import (
     chat_sample,
     distance,
     find_base,
+    provenance,
     read_folder,
 )
 from pipeline.videos.audit.files import quiet_level
@@ -99,7 +96,7 @@ def package(params: Params, variant: Variant, base: Base, out: Path) -> None:
             shutil.copytree(trained / ADAPTER_DIR, folder / LANGUAGE_DIR / ADAPTER_DIR)
         write_json(folder / CATALOGUE, catalogue.model_dump(mode="json"))
         config = ModelConfig(
-            format=FORMAT,
+            **provenance(folder),
             variant=variant.key,
             encoder_used=variant.encoder,
             opd=variant.opd,
@@ -116,11 +113,6 @@ def package(params: Params, variant: Variant, base: Base, out: Path) -> None:
             temperatures=temperatures,
             objects=read_json(aligned / OBJECTS_FILE),
             scores={task: score[1:4] for task, score in scores.items()},
-            files={f.relative_to(folder).as_posix(): sha256(f) for f in sorted(folder.rglob("*")) if f.is_file()},
-            versions={
-                "python": ".".join(platform.python_version_tuple()[:2]),
-                **{name: metadata.version(name) for name in LIBRARIES},
-            },
         )
         write_json(folder / CONFIG, config.model_dump(mode="json"))
         known = read_json(layout.REPORTS / params.report_name / "provenance.json")["settings"]

@@ -8,14 +8,12 @@ alone are read.
 
 from __future__ import annotations
 
-import platform
 import re
-from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pipeline.config import LANGUAGE_DIR, EncoderConfig, FramesConfig, LanguageConfig
-from pipeline.core.io import atomic_folder, fingerprint, load_tensors, save_tensors, sha256, write_json
+from pipeline.core.io import atomic_folder, fingerprint, load_tensors, save_tensors, write_json
 from pipeline.core.records import Encoder, Opd, Part
 from pipeline.language.base import ADAPTER_CONFIG, ADAPTER_WEIGHTS, load_tokenizer
 from pipeline.language.chat import TACT_END, TACT_START
@@ -28,12 +26,11 @@ from pipeline.use.folder import (
     CATALOGUE,
     CONFIG,
     ENCODER_DIR,
-    FORMAT,
-    LIBRARIES,
     TRAINED,
     Base,
     ModelConfig,
     chat_sample,
+    provenance,
 )
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.weights import DOWNLOADED
@@ -79,6 +76,7 @@ def convert(
         UserError: for a file that is missing, cut off or of another model, and for pickles that are not trusted.
     """
     import torch
+    from peft import LoraConfig
 
     def read(file: str) -> dict[str, torch.Tensor]:
         if not (source / file).is_file():
@@ -102,10 +100,8 @@ def convert(
     check_vicuna(base, CHECKPOINTS[name])
     words = read_form(base / LLM_CONFIG)["vocab_size"]
     matrix = adapter.pop(ADAPTER, torch.empty(0))
-    if len(matrix) != words + 2 or sorted(added.get(token, 0) for token in (TACT_START, TACT_END)) != [
-        words,
-        words + 1,
-    ]:
+    new = sorted(added.get(token, 0) for token in (TACT_START, TACT_END))
+    if len(matrix) != words + 2 or new != [words, words + 1]:
         raise UserError(
             f"{name}: {source} has {len(matrix)} word embeddings and the new tokens {added}, but {base} has {words} "
             "words; name the language model that it was trained on"
@@ -114,7 +110,8 @@ def convert(
     with atomic_folder(to) as folder:
         prompts = _write_encoder(name, folder / ENCODER_DIR, encoder, heads, clip, trust_pickle)
         width = project["0.weight"].shape[1]
-        frames = FramesConfig(selection="release", pixels=_side(folder / ENCODER_DIR / BACKBONE_DIR))
+        form = read_form(folder / ENCODER_DIR / BACKBONE_DIR / CLIP_CONFIG)
+        frames = FramesConfig(selection="release", pixels=form["model_cfg"]["vision_cfg"]["image_size"])
         # Embeddings are read as they come.
         statistics = Statistics(torch.zeros(width).double(), torch.ones(width).double(), fingerprint(frames))
         statistics.save(folder / ENCODER_DIR / STATISTICS_FILE)
@@ -129,14 +126,17 @@ def convert(
         used = {key: value for key, value in adapter.items() if ".lora_" in key}
         save_tensors(folder / LANGUAGE_DIR / ADAPTER_DIR / ADAPTER_WEIGHTS, used)
         kept = {key: settings[key] for key in ("r", "lora_alpha", "lora_dropout", "target_modules")}
-        _write_adapter_config(folder / LANGUAGE_DIR / ADAPTER_DIR, kept)
+        # As today's PEFT has them; the matrix of words is kept apart.
+        lora = LoraConfig(**kept, task_type="CAUSAL_LM").to_dict()
+        lora["target_modules"] = sorted(lora["target_modules"])
+        write_json(folder / LANGUAGE_DIR / ADAPTER_DIR / ADAPTER_CONFIG, lora)
         write_json(folder / CATALOGUE, catalogue.model_dump(mode="json"))
         language = LanguageConfig(
             weights=base.as_posix(), system_prompt=SYSTEM, chat="published", bos=False, max_new_tokens=400
         )
         met = (Part.TRAIN, Part.VALIDATION)
         model = ModelConfig(
-            format=FORMAT,
+            **provenance(folder),
             variant=name,
             encoder_used=Encoder.FINETUNED,
             heads=heads is not None,
@@ -153,11 +153,6 @@ def convert(
             temperatures=dict.fromkeys(catalogue.property_names, 1.0),
             objects=tuple(sorted(o.object_id for o in catalogue.objects.values() if o.splits["release"] in met)),
             scores={},
-            files={f.relative_to(folder).as_posix(): sha256(f) for f in sorted(folder.rglob("*")) if f.is_file()},
-            versions={
-                "python": ".".join(platform.python_version_tuple()[:2]),
-                **{name: metadata.version(name) for name in LIBRARIES},
-            },
         )
         write_json(folder / CONFIG, model.model_dump(mode="json"))
         write_card(
@@ -213,16 +208,3 @@ def _write_encoder(
                 trained[f"heads.{here}.{part}"] = heads[f"{there}.{part}"].float()
     save_tensors(folder / TRAINED, trained)
     return prompts.shape[1]
-
-
-def _side(backbone: Path) -> int:
-    side: int = read_form(backbone / CLIP_CONFIG)["model_cfg"]["vision_cfg"]["image_size"]
-    return side
-
-
-def _write_adapter_config(folder: Path, settings: dict[str, Any]) -> None:
-    """Write the adapter's settings as today's PEFT has them; the matrix of words is kept apart."""
-    from peft import LoraConfig
-
-    config = LoraConfig(**settings, task_type="CAUSAL_LM").to_dict()
-    write_json(folder / ADAPTER_CONFIG, {**config, "target_modules": sorted(config["target_modules"])})

@@ -5,14 +5,12 @@ from __future__ import annotations
 import os
 from typing import Literal, NamedTuple
 
-import numpy as np
-import numpy.typing as npt
 from pydantic import ConfigDict
 
 from pipeline.core.records import Record
 from pipeline.use.memory import Similar
+from pipeline.videos.frames.subtraction import Pictures
 
-Pictures = npt.NDArray[np.uint8]
 Video = str | os.PathLike[str] | Pictures
 """A file, or uint8, frames x height x width x RGB."""
 

@@ -79,19 +79,19 @@ def test_merging_keeps_other_questions_and_their_order(tmp_path: Path) -> None:
 
 def test_errors_have_intervals_over_objects() -> None:
     one = mean_of([1.0, 3.0, 2.0, 2.0], ["a", "a", "b", "b"])
-    assert (one.value, one.low, one.high) == (2, 2, 2)
+    assert (one.error, one.low, one.high) == (2, 2, 2)
     two = mean_of([1.0, 3.0], ["a", "b"])
     # Student's t with one degree of freedom: 12.706, deviation sqrt 2 over sqrt 2.
     assert two.high == pytest.approx(2 + 12.706, abs=1e-3)
     assert two.low == 0
     assert mean_of([1.0], ["a"]) == Error(1.0, n=1)
     share = share_of([1, 0, 0, 1], [(o,) for o in "abcd"])
-    assert share.low < share.value == 0.5 < share.high
+    assert share.low < share.error == 0.5 < share.high
     named = {"task": "t", "measure": "m", "encoder": "e", "seed": "all"}
     counted = {"right": 4, "unread": 0, "chance": 0.1, "n": 9, "sets": 4}
     score = ScoreRow.model_validate({**named, **counted, "accuracy": 0.5, "low": 0.4, "high": 0.7})
-    assert Error.of(score).columns == pytest.approx({"error": 0.5, "low": 0.3, "high": 0.6, "n": 9})
-    assert Error.of(score.model_copy(update={"low": None, "high": None})).columns == {"error": 0.5, "n": 9}
+    assert vars(Error.of(score)) == pytest.approx({"error": 0.5, "low": 0.3, "high": 0.6, "n": 9})
+    assert Error.of(score.model_copy(update={"low": None, "high": None})) == Error(0.5, n=9)
 
 
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,16 +14,13 @@ from hypothesis import strategies as st
 from torch.nn import functional as F
 from torch.utils.data import BatchSampler
 
-from pipeline.core.io import read_table, save_tensors
-from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Embedding, Question, Turn
+from pipeline.core.records import Question, Turn
 from pipeline.core.runtime import derive_seed
 from pipeline.language.begin import begin_with_words
 from pipeline.language.conversations import FILLER, UpdateSampler
 from pipeline.language.generate import write_prompt
 from pipeline.language.training import Material, assemble
-from pipeline.training.embeddings import EmbeddingStore
 from tests.checkpoints import write_llama
-from tests.conftest import refused
 from tests.language.conftest import CATALOGUE, DIM, FRAMES, generation, stored, taking
 
 
@@ -89,17 +86,6 @@ def test_given_descriptions_are_not_learnt_and_stand_beside_other_touches(share:
         assert text.split() == " ".join(t.assistant[t.described :] for t in turns).split()
     assert several
     assert changed == pytest.approx(share * several, abs=1)
-
-
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_an_embedding_that_is_not_finite_names_its_video(value: float, store: EmbeddingStore, tmp_path: Path) -> None:
-    (tmp_path / INDEX_FILE).write_bytes((store.folder / INDEX_FILE).read_bytes())
-    entry = read_table(store.folder / INDEX_FILE, Embedding)[-1]
-    tensor = store.tensor.clone()
-    tensor[entry.row, 2] = value
-    save_tensors(tmp_path / TENSOR_FILE, {TENSOR: tensor})
-    with refused(f"safetensors: {entry.video_id} has an embedding that is not finite.*dvc repro"):
-        EmbeddingStore(tmp_path)
 
 
 def felt(labels: tuple[int, ...], drawn: torch.Generator) -> torch.Tensor:

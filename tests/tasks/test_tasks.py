@@ -1,6 +1,5 @@
 """Every task grades its own answers as right and everything else as wrong or unread."""
 
-import math
 from collections.abc import Iterator
 
 import pytest
@@ -298,11 +297,3 @@ def test_no_text_crashes_a_grader(task: str, number: int, text: str) -> None:
         assert score.parsed or (not score.correct and score.predicted == "")
         assert score.correct == (score.predicted == score.expected)
         assert score.truncated
-
-
-def test_chance_is_that_of_a_uniform_guess() -> None:
-    expected = {"PC": 1 / 3, "PSS": 1 / 3, "POM": 1 / 6, "PSR": 1 / 2, "RIPE": 1 / 2}
-    assert {task: TASKS[task].chance(CATALOGUE) for task in expected} == {t: {"choice": v} for t, v in expected.items()}
-    described = TASKS["OPD"].chance(CATALOGUE)
-    assert described["combined"] == pytest.approx(1 / 27)
-    assert math.prod(described[p] for p in CATALOGUE.property_names) == pytest.approx(described["combined"])

@@ -38,11 +38,7 @@ def fake() -> FakeOctopi:
 def client(fake: FakeOctopi) -> Iterator[TestClient]:
     app = make_app(fake, "octopi", token=TOKEN, places=2)
     headers = {"Authorization": f"Bearer {TOKEN}"}
-    with (
-        TestClient(app, headers=headers, raise_server_exceptions=False) as client,
-        pytest.MonkeyPatch.context() as patch,
-    ):
-        patch.setattr("pipeline.use.serve.MOST_BYTES", 400_000)
+    with TestClient(app, headers=headers, raise_server_exceptions=False) as client:
         yield client
 
 

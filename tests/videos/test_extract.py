@@ -26,7 +26,6 @@ from pipeline.videos.frames.reference import reference_indices
 from pipeline.videos.frames.scan import Scan, scan
 from pipeline.videos.frames.selection import kept_count
 from pipeline.videos.records import Finding, Frame, Probe
-from tests import frame_rules
 from tests.conftest import encode, moving_square, not_utf8, refused, write_video
 from tests.frame_rules import CONFIG, FILES, Place, constant, frames_of, luma, pressing, promising, salience, scanned
 
@@ -183,9 +182,6 @@ def test_short_videos_are_left_out_by_the_published_rule(place: Place, caplog: p
     assert [p.video_id for p in found.probes] == NAMES
     assert [p.kept for p in found.probes] == [0, 0, 0, 6, 0, 9, 0]
     assert len([r for r in caplog.records if "too few" in r.message]) == 5
-    for video in found.videos:
-        own = [(f.frame_index, int(f.score)) for f in found.frames if f.video_id == video.video_id]
-        assert own == frame_rules.published(place.folder / video.path, video.frames)
     assert len(np.load(place.out / "references.npy")) == 2
 
 

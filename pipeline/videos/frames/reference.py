@@ -66,12 +66,9 @@ def mean(pictures: Sequence[Image]) -> Image:
     return rounded
 
 
-def thumbnail(frame: av.VideoFrame, channels: int = 3) -> Image:
-    """A frame with its longer side at `THUMB` pixels: uint8, height x width x (brightness, two colour differences).
-
-    With one channel it is the brightness alone, height x width, for a third of the cost.
-    """
-    shown = planes(frame)[:channels]
+def thumbnail(frame: av.VideoFrame) -> Image:
+    """A frame with its longer side at `THUMB` pixels: uint8, height x width x (brightness, two colour differences)."""
+    shown = planes(frame)
     height, width = shown[0].shape
     scale = THUMB / max(height, width)
     size = max(1, round(width * scale)), max(1, round(height * scale))

@@ -64,8 +64,8 @@ class BestFrames:
     def __init__(self, frames: int, config: FramesConfig) -> None:
         self.frames, self.config = frames, config
         self.capacity = kept_count(frames, config)
-        self._heap: list[tuple[float, int, int]] = []  # Smallest (score, -index) first: the next to go. Then the slot.
-        self._held: list[av.VideoFrame | Image] = []
+        # Smallest (score, -index) first: the next to go. An index comes once, so that frames are never compared.
+        self._heap: list[tuple[float, int, av.VideoFrame | Image]] = []
         self._before: tuple[av.VideoFrame, Image] | None = None
 
     def consider(self, index: int, frame: av.VideoFrame) -> None:
@@ -90,16 +90,9 @@ class BestFrames:
         # 1.5 bytes a pixel: 4:2:0 keeps brightness in full and two colour planes at a quarter of the size.
         heavy = self.capacity * frame.width * frame.height * 1.5 > HELD_BYTES
         held = fit(frame, self.config) if heavy else frame
-        if full:
-            slot = self._heap[0][2]
-            heapq.heapreplace(self._heap, (score, -index, slot))
-            self._held[slot] = held
-        else:
-            heapq.heappush(self._heap, (score, -index, len(self._held)))
-            self._held.append(held)
+        (heapq.heapreplace if full else heapq.heappush)(self._heap, (score, -index, held))
 
     def kept(self) -> list[Kept]:
         """What was kept, in time order."""
-        chosen = sorted((-back, score, slot) for score, back, slot in self._heap)
-        held = ((index, score, self._held[slot]) for index, score, slot in chosen)
-        return [Kept(i, score, h if isinstance(h, np.ndarray) else fit(h, self.config)) for i, score, h in held]
+        chosen = sorted(self._heap, key=lambda one: -one[1])
+        return [Kept(-i, score, h if isinstance(h, np.ndarray) else fit(h, self.config)) for score, i, h in chosen]
