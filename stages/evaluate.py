@@ -2,6 +2,7 @@
 
 from collections import Counter
 from itertools import product
+from pathlib import Path
 
 from pipeline.core.io import code_of, fingerprint, read_table, write_table
 from pipeline.core.layout import CHECKPOINTS, EVALUATED, SHIPPED, VIDEOS, split_file
@@ -14,12 +15,13 @@ from pipeline.videos.records import Assignment, Video
 if __name__ == "__main__":
     with stage("evaluate") as run:
         from pipeline.use.evaluate import answers_about, answers_after_ratings, check_rated
+        from pipeline.use.folder import read_folder
         from pipeline.use.model import Octopi
 
         params, graded = run.params, list[GradedVision]()
-        several = [name for name, count in Counter(params.evaluate.models).items() if count > 1]
-        if several:
-            raise UserError(f"evaluate.models names {several[0]} twice; name each once")
+        names = [f if f == SHIPPED.name else read_folder(Path(f))[0].variant for f in params.evaluate.models]
+        if several := [name for name, count in Counter(names).items() if count > 1]:
+            raise UserError(f"evaluate.models has two models that are called {several[0]}; name one of them")
         if params.evaluate.models:
             # As many on every machine, since sums depend on how they are shared out.
             limit_threads(2)
@@ -36,7 +38,8 @@ if __name__ == "__main__":
             for count, (seed, split) in product(params.evaluate.rated, splits.items()):
                 # A killed stage goes on behind what is answered; the key is all that this depends on, code included.
                 told = (octopi.config.digest, params.questions, params.data, params.split, params.language.dtype)
-                key = fingerprint(*map(str, (*told, count, seed)), VIDEOS, split_file(seed), *code_of("evaluate"))
+                files = (VIDEOS, split_file(seed), Path(params.data.catalogue), *code_of("evaluate"))
+                key = fingerprint(*map(str, (*told, params.kernels, count, seed)), *files)
                 if not (done := CHECKPOINTS / "evaluate" / key / EVALUATED.name).is_file():
                     said = answers_after_ratings(octopi, params, videos, split, seed, count)
                     write_table(done, GradedVision, said)

@@ -32,7 +32,7 @@ if __name__ == "__main__":
         inputs = [FRAMES / TABLE_FILE, FRAMES / REFERENCES_FILE, split_file(seed)]
         inputs += backbone_files(params.encoder)
         with live(run) as callbacks:
-            training = Training(data, params.encoder, params.runtime, params.seed + seed, inputs, callbacks)
+            training = Training(data, params.encoder, params.runtime, params.seed + seed, inputs, run.name, callbacks)
             model, history = finetune(training)
         device = resolve_device(params.runtime.device)
         classified = classify(model, data, [Part.VALIDATION, Part.TEST], params.encoder.batch_size, device)

@@ -6,7 +6,6 @@ fits heads to frozen backbones and then tunes both (`pipeline.encoder.tuned`).
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -49,6 +48,8 @@ class Training:
     seed: int
     inputs: Sequence[Path]
     """Files that a training by gradients depends on, for its checkpoints' fingerprint."""
+    stage: str = "finetune_encoder@0"
+    """In whose folder checkpoints lie, until all is written."""
     callbacks: Sequence[TrainerCallback] = ()
     """Further callbacks for its Trainer, such as tracking."""
 
@@ -116,7 +117,7 @@ def train_classifier(model: PropertyClassifier, training: Training, trunks: Trun
     chosen = data.videos(Part.VALIDATION)
     # Labels are part of the checkpoints' key, so that after a correction no training resumes from the wrong labels.
     labelled = repr([(a.video_id, a.part, data.catalogue.labels(a.object_id)) for a in data.assignments])
-    folder = checkpoint_dir("finetune_encoder", config, training.seed, data.per_video, labelled, *training.inputs)
+    folder = checkpoint_dir(training.stage, config, training.seed, data.per_video, labelled, *training.inputs)
     # The published code's cosine falls to a hundredth within one epoch and rises again in the next: half a cycle an
     # epoch.
     waves = {
@@ -153,9 +154,7 @@ def train_classifier(model: PropertyClassifier, training: Training, trunks: Trun
         compute_metrics=measures,
         callbacks=training.callbacks,
     )
-    history = train(trainer).history
-    shutil.rmtree(folder, ignore_errors=True)
-    return history
+    return train(trainer).history
 
 
 def write_encoder_card(folder: Path, data: EncoderData, config: EncoderConfig, seed: int, source: str) -> None:

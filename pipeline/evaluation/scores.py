@@ -137,7 +137,12 @@ def with_holm(rows: Sequence[EffectRow]) -> list[EffectRow]:
 def difference(one: Runs, other: Runs) -> Difference | None:
     """How much more often the first is right, on the questions and seeds that both have; None where there are none."""
     seeds = sorted(one.keys() & other.keys())
-    asked = _shared([runs[seed] for runs in (one, other) for seed in seeds])
+    asked = [
+        q
+        for q in _shared([runs[seed] for runs in (one, other) for seed in seeds])
+        # Where names are others, a matching question of one number is about other objects.
+        if all(one[s][q].objects == other[s][q].objects for s in seeds)
+    ]
     if not asked:
         return None
     gains = [[float(one[s][q].correct) - float(other[s][q].correct) for q in asked] for s in seeds]

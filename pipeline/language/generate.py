@@ -97,6 +97,11 @@ def answer(
                 turns = [Turn(user=t.user, assistant=a) for t, a in zip(dialogue.turns, own, strict=False)]
                 single = len(dialogue.turns) == 1
                 prompt = write_prompt(turns, model.tokenizer, language, per_video, single=single)
+                if (
+                    number and model.positions is not None and len(prompt) >= model.positions
+                ):  # What it said itself leaves no room.
+                    said[question.question_id].append(Generated("", 0, truncated=True))
+                    continue
                 check_length(question.question_id, len(prompt) + 1, model.positions)
                 waiting.append((question, prompt))
         features = [evaluation_features(q, store, per_video) for q, _ in waiting]

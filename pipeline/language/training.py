@@ -25,7 +25,7 @@ from pipeline.running.errors import UserError
 from pipeline.training.card import write_card
 from pipeline.training.embeddings import EmbeddingStore
 from pipeline.training.trainer import TrainableTrainer, Trained, checkpoint_dir, train, training_arguments
-from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.catalogue import OBJECTS, PROPERTIES, Catalogue, load_catalogue
 
 logger = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ class Material:
     source: str = "videos"
     """`data.source`: whether the videos are synthetic."""
     files: tuple[Path, ...] = ()
-    """Input files, and folders of such: questions, embeddings, catalogue, and the model that training starts from."""
+    """Input files, and folders of such: questions, embeddings, objects, properties, the model that it starts from."""
     adapter: Path | None = None
     """Folder of the adapter of `language.start`, which alignment leaves as it is."""
 
@@ -57,7 +57,7 @@ class Material:
         begun = Path(start) / LANGUAGE_DIR / ADAPTER_DIR
         adapter = begun if start and begun.is_dir() else None
         catalogue = Path(params.data.catalogue)
-        files = [asked, embedded, catalogue]
+        files = [asked, embedded, catalogue / OBJECTS, catalogue / PROPERTIES]
         if start:
             files.append(Path(start) / CONFIG_FILE)
         if adapter:

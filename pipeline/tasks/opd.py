@@ -81,11 +81,14 @@ def as_published(said: str, labels: tuple[int, ...], catalogue: Catalogue) -> di
     if not all(before.strip() for before, _ in fields):  # Nothing stands between two classes to cut at.
         return dict.fromkeys((*catalogue.property_names, "combined"))
     opening, (ending, last) = fields[0][0], fields[-1]
+    wrong: dict[str, bool | None] = dict.fromkeys((*catalogue.property_names, "combined"), False)
+    if opening not in said:
+        return wrong
     rest, values = said.split(opening)[-1], []
     for before, _ in fields[1:]:
         value, cut, rest = rest.partition(before.rstrip())
-        if not cut or opening not in said:
-            return dict.fromkeys((*catalogue.property_names, "combined"), False)
+        if not cut:
+            return wrong
         values.append(value.strip())
     levels = {p.name: p.levels[label] for p, label in zip(catalogue.properties, labels, strict=True)}
     found = {name: value == levels[name] for (_, name), value in zip(fields, values, strict=False)}

@@ -76,7 +76,8 @@ def asked(opening: str, names: Iterable[str]) -> dict[Opd, str]:
 
 def read(answer: str, names: Sequence[str]) -> dict[str, int] | None:
     """Each letter's place among the names, from "a) is NAME": one name for each, and no name twice; else None."""
-    known = [unmarked(name).lower() for name in names]
+    # As they stand behind "is": a name that begins like an item of a list keeps that.
+    known = [" ".join(unmarked(f"is {name}").removeprefix("is ").split()).lower() for name in names]
     said = "|".join(re.escape(name) for name in sorted(known, key=len, reverse=True))
     pattern = rf"\b([abc])(?:\)|(?=\s*[:=-]|\s+is\b))(?:\s*:|\s*=|\s*->?|\s+is)?\s+({said})(?!'?\w|\s+or\b)"
     pairs = re.findall(pattern, " ".join(base.conclusion(answer)), flags=re.IGNORECASE)

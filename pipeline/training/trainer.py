@@ -28,7 +28,7 @@ from pipeline.config import EncoderConfig, PretrainConfig, RuntimeConfig, TrainC
 from pipeline.core.io import code_of, fingerprint
 from pipeline.core.layout import CHECKPOINTS
 from pipeline.core.records import Measurement
-from pipeline.core.runtime import limit_threads, resolve_device
+from pipeline.core.runtime import PORTABLE, limit_threads, resolve_device
 from pipeline.running.errors import UserError
 from pipeline.running.progress import LogLines
 from pipeline.training.sampling import EpochDataset
@@ -162,10 +162,11 @@ class TrainingMonitor(TrainerCallback):
 def checkpoint_dir(stage: str, *parts: BaseModel | str | int | Path) -> Path:
     """Where a training keeps its checkpoints, outside DVC's reach (DVC deletes a killed stage's outputs).
 
-    The key has the stage's code, `stage` being its name in dvc.yaml, and `parts`, the settings and input files that the
-    training depends on: one version never goes on with another's training.
+    The key has the stage's code, `stage` being its name in dvc.yaml, the kernels, and `parts`, the settings and input
+    files that the training depends on: one version never goes on with another's training.
     """
-    return CHECKPOINTS / stage / fingerprint(*parts, *code_of(stage))
+    portable = PORTABLE.items() <= os.environ.items()
+    return CHECKPOINTS / stage / fingerprint(*parts, str(portable), *code_of(stage))
 
 
 @dataclass(frozen=True)

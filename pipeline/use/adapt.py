@@ -114,7 +114,11 @@ def adapt(
     if sum(len(video.raw) for video in encoded) < 2:
         raise UserError("one frame has no deviation; name more videos")
     made = _without_ratings(model, encoded) if catalogue is None else _rated(model, encoded, catalogue, objects, seed)
-    update: dict[str, Any] = {"scores": {}, "temperatures": made.temperatures or config.temperatures}
+    update: dict[str, Any] = {
+        "variant": to.name,
+        "scores": {},
+        "temperatures": made.temperatures or config.temperatures,
+    }
     update["trained_on"] = FITTED if catalogue is None and not config.calibrated else "videos"
     # Rounded up to the digits that config.json keeps, so that the farthest video itself is not flagged.
     farthest = max(distance(standardize(video.raw, made.statistics).double().numpy()) for video in encoded)

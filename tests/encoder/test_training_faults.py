@@ -37,12 +37,14 @@ pytestmark = pytest.mark.usefixtures("elsewhere")
 
 
 def trained(
-    kind: RecipeName, weights: Path, data: EncoderData, *, factor: float = 1.0, **changes: object
+    kind: RecipeName, weights: Path, data: EncoderData, *, factor: float = 1.0, keep: bool = False, **changes: object
 ) -> tuple[list[Measurement], State]:
-    """The history and end state of a training, with the learning rate times `factor`."""
+    """History and end state of a training with the learning rate times `factor`; its checkpoints go, unless `keep`."""
     setting = setting_of(kind, weights, **changes)
     setting = setting.model_copy(update={"learning_rate": factor * setting.learning_rate})
     model, history = finetune(training(data, setting))
+    if not keep:
+        shutil.rmtree("checkpoints")  # As the stage does, when all is written.
     return history, trainable_state(model)
 
 
@@ -116,7 +118,7 @@ def in_order(history: list[Measurement]) -> list[tuple[int, str, float]]:
 def test_a_killed_training_ends_as_if_it_had_not_been(
     kind: RecipeName, validated: bool, weights: Path, catalogue: Catalogue, tmp_path: Path, before_updates: Hook
 ) -> None:
-    """Killed in the second epoch, and again in the third.
+    """Killed in the second epoch, again in the third, and once more behind the last, before anything is written.
 
     `release` drops units at random, `tuned` trains above what its trunk makes of mirrored frames.
     """
@@ -124,18 +126,17 @@ def test_a_killed_training_ends_as_if_it_had_not_been(
     run = partial(trained, kind, weights, data, epochs=3, batch_size=2)
     epoch = 3 if validated else 4
     history, state = run()
-    shutil.rmtree("checkpoints")
     begun: list[int] = []
     before_updates(killed_at([epoch + 1, 2 * epoch + 2], begun))
     for left in (epoch, 2 * epoch):
         with pytest.raises(KeyboardInterrupt):
             run()
         assert f"checkpoint-{left}" in {f.name for f in Path("checkpoints").glob("*/*/*")}
-    resumed, end = run()
-    assert in_order(resumed) == in_order(history)
-    same(state, end)
-    assert len(begun) == (epoch + 2) + (epoch + 1) + epoch, "only what the last checkpoint lacked was done again"
-    assert not any(tmp_path.glob("checkpoints/*/*"))
+    for keep in (True, False):  # First as where what it gave could not be written.
+        resumed, end = run(keep=keep)
+        assert in_order(resumed) == in_order(history)
+        same(state, end)
+        assert len(begun) == (epoch + 2) + (epoch + 1) + epoch, "only what the last checkpoint lacked was done again"
 
 
 def unwritten(file: Path) -> None:

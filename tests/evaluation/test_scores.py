@@ -130,6 +130,10 @@ def test_training_is_compared_with_the_most_ratings() -> None:
     (row,) = effect_rows(graded("PC", full), CATALOGUE, vision=others)
     assert (row.part, row.change, row.n) == ("training", "full system - m, adapted by 20 rated objects", 15)
     assert row.difference == pytest.approx(np.mean(full) - np.mean(most), abs=1e-6)
+    # A question that has the number of another, as matching has it under other names, is no pair.
+    others = [o.model_copy(update={"objects": o.objects[::-1]}) if n % 15 > 9 else o for n, o in enumerate(others)]
+    (row,) = effect_rows(graded("PC", full), CATALOGUE, vision=others)
+    assert (row.n, row.difference) == (10, pytest.approx(np.mean(full[:10]) - np.mean(most[:10]), abs=1e-6))
 
 
 Classes = tuple[int, int, int]

@@ -9,13 +9,13 @@ from torch.nn import functional as F
 from transformers import DynamicCache, LlamaForCausalLM, MistralConfig, MistralForCausalLM
 
 from pipeline.config import LanguageConfig
-from pipeline.core.records import Opd, Question
+from pipeline.core.records import Opd, Question, Turn
 from pipeline.language import decoding
 from pipeline.language.cache import AHEAD, roomy_cache
 from pipeline.language.chat import IGNORE_INDEX, encode, render
 from pipeline.language.conversations import evaluation_features
 from pipeline.language.decoding import greedy
-from pipeline.language.generate import answer
+from pipeline.language.generate import answer, write_prompt
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import assemble
 from pipeline.training.embeddings import EmbeddingStore
@@ -216,6 +216,14 @@ def test_what_ends_where_positions_do(questions: list[Question], store: Embeddin
     assert len(set(room)) > 2
     assert all(p.tokens <= own and p.truncated == (p.tokens == own) for p, own in zip(together, room, strict=True))
     assert any(p.tokens == 5 for p in together)
+    # What fills the positions in its first turn has nothing left to say in the second.
+    twice = [q for q in questions if q.task == "PSR"]
+    first = [Turn(user=q.dialogue(Opd.ALL).turns[0].user, assistant="") for q in twice]
+    longest = max(len(write_prompt([t], wide.tokenizer, generation(1), FRAMES, single=False)) for t in first)
+    folder = write_llama(tmp_path / "full", pad="</s>", max_position_embeddings=longest + 1)
+    said = answer(OctopiForCausalLM.from_base(folder, DIM), store, twice, Opd.ALL, generation(2, 40), FRAMES)
+    assert all(len(p.outputs) == 2 for p in said)
+    assert any(p.truncated and p.outputs[1] == "" for p in said)
     setting = LanguageConfig(weights=str(write_llama(tmp_path, max_position_embeddings=60)))
     with refused(r"^[A-Z]+-train-\d+: takes \d+ tokens, .* 60 at once; lower frames.per_video"):
         assemble(material(setting, questions, store), taking(4), "test")

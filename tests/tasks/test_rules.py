@@ -16,6 +16,7 @@ from pipeline.evaluation.grading import conclude
 from pipeline.evaluation.scores import RULES, effect_rows, score_rows
 from pipeline.tasks import TASKS
 from pipeline.tasks.opd import as_published
+from pipeline.tasks.pom import read
 from pipeline.tasks.questions import build_questions
 from pipeline.tasks.records import Score
 from pipeline.videos.catalogue import Catalogue
@@ -213,3 +214,18 @@ def test_what_cannot_be_cut_is_not_compared() -> None:
     bare = CATALOGUE.language.model_copy(update={"structured": "Overall, {hardness} {roughness} thing, {bumpiness}."})
     found = as_published("It is a hard rough thing.", (0, 0, 0), Catalogue(language=bare, objects=CATALOGUE.objects))
     assert found == dict.fromkeys((*CATALOGUE.property_names, "combined"))
+
+
+def test_one_property_without_the_opening_is_wrong() -> None:
+    properties = CATALOGUE.language.properties[:1]
+    texts = {"structured": "Overall, it is {hardness}.", "unstructured": "It feels {hardness}.", "scenarios": ()}
+    one = CATALOGUE.language.model_copy(update={**texts, "properties": properties})
+    for said, right in (("Overall, it is soft.", True), ("soft.", False), ("Overall, it is hard.", False)):
+        found = as_published(said, (0,), Catalogue(language=one, objects={}))
+        assert found == {"hardness": right, "combined": right}
+
+
+def test_names_that_begin_like_an_item_of_a_list_are_read() -> None:
+    names = ("1. foam", "2. foam", "#400  sandpaper")
+    said = "Conclusion: a) is 2. foam, b) is #400  sandpaper and c) is 1. foam."
+    assert read(said, names) == {"a": 1, "b": 2, "c": 0}

@@ -66,6 +66,7 @@ def test_equal_inputs_give_equal_folders(made: Made, tmp_path: Path, monkeypatch
 def test_the_stage_packages_what_is_asked_for(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(made.folder.parents[1], tmp_path, dirs_exist_ok=True)
     shutil.rmtree(tmp_path / "models")
+    (tmp_path / "models" / "octopi-lab-left-1").mkdir(parents=True)
     for trained in (tmp_path / "data" / "models").iterdir():
         shutil.copytree(trained / "finetuned-all-0", trained / "finetuned-none-0")
     monkeypatch.chdir(tmp_path)
@@ -74,7 +75,9 @@ def test_the_stage_packages_what_is_asked_for(made: Made, tmp_path: Path, monkey
         own = {name: getattr(made.params, name) for name in ("frames", "encoder", "language")}
         write_params(fake_params(*lists, *overrides).model_copy(update=own))
         runpy.run_path(str(ROOT / "stages" / "package.py"), run_name="__main__")
-        assert sorted(f.name for f in (tmp_path / "models").iterdir()) == sorted([made.variant.key, *made_too])
+        assert sorted(f.name for f in (tmp_path / "models").iterdir()) == sorted(
+            [made.variant.key, "octopi-lab-left-1", *made_too]
+        ), "what somebody put there stays"
 
 
 def test_export_with_its_base_needs_nothing_else(made: Made, copy: Path, files: list[Path], tmp_path: Path) -> None:
