@@ -6,6 +6,7 @@ What lies on disk is the truth: it is read anew at every call, and each change i
 from __future__ import annotations
 
 import csv
+import logging
 import os
 import re
 import shutil
@@ -26,6 +27,10 @@ from pipeline.videos.catalogue.csv_reader import Row, read_rows
 from pipeline.videos.catalogue.wording import Language
 from pipeline.videos.files import LIST_FILE, video_files
 from pipeline.videos.importing.presses import Recorded, first_free
+
+log = logging.getLogger(__name__)
+LONGEST_ID = 100
+"""Letters of an object's id, which file names begin with."""
 
 RATINGS = "ratings.csv"
 ASIDE = ".deleted"
@@ -50,8 +55,18 @@ class RatedFolder:
         self.names = [p.name for p in self.properties]
         remove_rests(folder)
         shutil.rmtree(self.videos / ASIDE, ignore_errors=True)
+        # What was written by hand may hold more than is written here: lines without ratings, files that are elsewhere.
+        stamp, kept = time.strftime("%Y%m%d-%H%M%S"), dict[Path, Path]()
+        for file in (self.catalogue / RATINGS, self.catalogue / OBJECTS, self.videos / LIST_FILE):
+            if file.is_file():
+                kept[file] = Path(shutil.copyfile(file, file.with_name(f"{file.name}.{stamp}")))
         self.save(self.ratings())
         self.list_videos()
+        for file, copy in kept.items():
+            if file.is_file() and file.read_bytes() == copy.read_bytes():
+                copy.unlink()
+            else:
+                log.warning("%s: written anew; %s is as it was", file, copy.name)
 
     # ---- ratings ----
 
@@ -70,9 +85,11 @@ class RatedFolder:
         """The id of an object, by which its videos are called: a new one's is its name, with _ for blanks and signs."""
         known = {row["name"].lower(): row["object_id"] for row in self._read(OBJECTS, ["object_id", "name"])}
         plain = unicodedata.normalize("NFC", name).strip().lower()
-        if key := known.get(plain) or re.sub(r"[^\w-]+", "_", plain).strip("_-"):
+        key = known.get(plain) or re.sub(r"[^\w-]+", "_", plain).strip("_-")
+        if 0 < len(key) <= LONGEST_ID:
             return key
-        raise UserError(f"{name!r}: no name for an object; write one with its article, such as: a block of foam")
+        told = f"write one of up to {LONGEST_ID} letters, with its article, such as: a block of foam"
+        raise UserError(f"{name[:LONGEST_ID]!r}: no name for an object; {told}")
 
     def save(self, rows: Sequence[Row]) -> None:
         """Write ratings.csv, and objects.csv with each object that has a class of every property from somebody.
@@ -80,14 +97,15 @@ class RatedFolder:
         Names and other columns of objects.csv stay as they are; a new object is called by its id.
         """
         self._write(RATINGS, ["object_id", "rater", *self.names], rows)
-        old, lines = {row["object_id"]: row for row in self._read(OBJECTS, ["object_id", "name"])}, list[Row]()
+        file = self.catalogue / OBJECTS
+        header, before = read_rows(file, ["object_id", "name"]) if file.exists() else ([], [])
+        old, lines = {row["object_id"]: row for _, row in before}, list[Row]()
         for key in dict.fromkeys(row["object_id"] for row in rows):
             own = [row for row in rows if row["object_id"] == key]
             cells = {p: " ".join(row[p] for row in own if row.get(p)) for p in self.names}
             if all(cells.values()):
                 lines.append({"object_id": key, "name": key.replace("_", " ")} | old.get(key, {}) | cells)
-        columns = dict.fromkeys(["object_id", "name", *self.names, *(c for line in old.values() for c in line)])
-        self._write(OBJECTS, columns, lines)
+        self._write(OBJECTS, dict.fromkeys(["object_id", "name", *self.names, *header]), lines)
 
     def rate(self, rater: str, object_id: str, property: str, level: int) -> None:
         """Write down one class that a rater gives an object."""
@@ -112,9 +130,9 @@ class RatedFolder:
             The name that it had, and what each of its videos was called, by what it is called now.
         """
         rows, videos, lines = self.ratings(), self.recorded(), self._read(OBJECTS, ["object_id", "name"])
-        if new in {row["object_id"] for row in rows} | {video.object_id for video in videos}:
+        if new != old and new in {row["object_id"] for row in rows} | {video.object_id for video in videos}:
             raise UserError(f"{new}: is another object; give the videos to it one by one")
-        own = [video.file for video in videos if video.object_id == old]
+        own = [video.file for video in videos if video.object_id == old != new]
         moved = {self.move(file, new, (files or {}).get(file, ""))[0]: file for file in own}
         names = {line["object_id"]: line["name"] for line in lines}
         lines = [line | {"object_id": new, "name": name} if line["object_id"] == old else line for line in lines]

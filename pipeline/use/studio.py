@@ -46,7 +46,7 @@ RECENT, LOST = 150, 3
 """Pictures that rate and drops are measured on, and how many of them may be missing without a word."""
 AGAIN = 2.0
 """Seconds until a camera that is gone is looked for again."""
-Text = Annotated[str, Body(embed=True, max_length=100)]
+Text = Annotated[str, Body(embed=True, max_length=4096)]
 
 
 class Sensor:
@@ -76,7 +76,7 @@ class Sensor:
                 for press in presses(self._shots(), self.times, self._see):
                     self.tell(self._doubts(), press)
                 self.gone = f"{self.camera}: has ended"
-            except UserError as error:
+            except Exception as error:  # Also what OpenCV raises where a stream changes its size: it is opened again.
                 self.gone = str(error)
             if Path(self.camera).is_file():
                 return
@@ -205,7 +205,7 @@ class Studio(Session):
                     self.data.list_videos()
                     self.undos.append(lambda: self.data.move(file, ""))
                 said = ": ".join(filter(None, (file, odd)))
-            except (UserError, OSError) as error:
+            except Exception as error:  # Nobody waits for this thread, so whatever it is must be said here.
                 said = f"a press could not be written: {error}"
         self.events.append({"text": said, "file": file})
 
@@ -229,7 +229,12 @@ class Studio(Session):
         with self.lock:
             new = self.data.id_of(name)
             old, files = self.data.rename(object_id, new, name)
-            self.undos.append(lambda: self.data.rename(new, object_id, old, files))
+
+            def back() -> None:
+                self.data.rename(new, object_id, old, files)
+                self.target = object_id if self.target == new else self.target
+
+            self.undos.append(back)
             self.target = new if self.target == object_id else self.target
 
     def undo(self) -> None:

@@ -95,6 +95,10 @@ def test_a_folder_written_by_hand_stays_as_it_is(tmp_path: Path) -> None:
     assert [video.file for video in data.recorded()] == ["pane_0.mp4"]
     with refused("is another object"):
         data.rename("foam", "pane", "a pane")
+    data.rename("pane", "pane", "a pane")
+    assert load_catalogue(catalogue).objects["pane"].name == "a pane", "another name, the same id"
+    with refused("no name for an object"):
+        data.id_of("x" * 101)
     (catalogue / "properties.yaml").write_text("properties: [\n")
     with refused("properties.yaml: "):
         RatedFolder(tmp_path, PROPERTIES)
@@ -156,3 +160,19 @@ def test_undo_gives_back_what_was_step_by_step(steps: list[tuple[str, int]]) -> 
             assert shown() == before.pop()
             desk.undo()
         assert shown() == before.pop()
+
+
+def test_what_was_written_by_hand_is_kept_where_it_would_be_lost(tmp_path: Path) -> None:
+    """A line prepared for ratings, a video that is not there yet, a column of one's own."""
+    (catalogue := tmp_path / "catalogue").mkdir()
+    (videos := tmp_path / "videos").mkdir()
+    objects = "object_id,name,hardness,roughness,bumpiness,split_lab\nfoam,a block of foam,,,,train\n"
+    listed = "file,object_id,session,force\nelsewhere/a.mp4,foam,monday,2\n"
+    (catalogue / "objects.csv").write_text(objects)
+    (videos / "videos.csv").write_text(listed)
+    opened(tmp_path)
+    assert [f.read_text() for f in catalogue.glob("objects.csv.*")] == [objects]
+    assert [f.read_text() for f in videos.glob("videos.csv.*")] == [listed]
+    assert len([*tmp_path.rglob("*.csv.*")]) == 2
+    opened(tmp_path)
+    assert len([*tmp_path.rglob("*.csv.*")]) == 2, "nothing was lost the second time"

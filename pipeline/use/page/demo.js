@@ -26,7 +26,8 @@ function tell(text, busy = false) {
 
 async function failed(response) {
   const body = await response.json().catch(() => ({}));
-  return body.error || body.detail || `The server answered with status ${response.status}; see its terminal.`;
+  const detail = Array.isArray(body.detail) ? body.detail.map(found => found.msg).join("; ") : body.detail;
+  return body.error || detail || `The server answered with status ${response.status}; see its terminal.`;
 }
 
 function strip(title, pictures, captions) {

@@ -247,6 +247,7 @@ function draw_sensor(live) {
 
 async function feel(file) {
   if (touches.length >= MOST) touches.shift();
+  fresh = fresh.filter(id => touches.some(touch => touch.id === id));
   await show(`api/presses/${encodeURIComponent(file)}`, null, file);
   const touch = touches.at(-1);
   if (!touch || touch.name !== file) return;
