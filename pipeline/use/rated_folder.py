@@ -13,6 +13,7 @@ import shutil
 import time
 import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
+from datetime import datetime
 from itertools import zip_longest
 from pathlib import Path
 
@@ -56,7 +57,7 @@ class RatedFolder:
         remove_rests(folder)
         shutil.rmtree(self.videos / ASIDE, ignore_errors=True)
         # What was written by hand may hold more than is written here: lines without ratings, files that are elsewhere.
-        stamp, kept = time.strftime("%Y%m%d-%H%M%S"), dict[Path, Path]()
+        stamp, kept = f"{datetime.now():%Y%m%d-%H%M%S-%f}", dict[Path, Path]()  # To the microsecond: no older copy's.
         for file in (self.catalogue / RATINGS, self.catalogue / OBJECTS, self.videos / LIST_FILE):
             if file.is_file():
                 kept[file] = Path(shutil.copyfile(file, file.with_name(f"{file.name}.{stamp}")))

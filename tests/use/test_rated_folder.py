@@ -176,3 +176,7 @@ def test_what_was_written_by_hand_is_kept_where_it_would_be_lost(tmp_path: Path)
     assert len([*tmp_path.rglob("*.csv.*")]) == 2
     opened(tmp_path)
     assert len([*tmp_path.rglob("*.csv.*")]) == 2, "nothing was lost the second time"
+    (catalogue / "objects.csv").write_text(objects)
+    opened(tmp_path)
+    kept = [f.read_text() for f in catalogue.glob("objects.csv.*")]
+    assert kept == [objects, objects], "a copy took an older one's place, within one second"
