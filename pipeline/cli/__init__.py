@@ -165,7 +165,7 @@ def publish() -> None:
 
 
 Catalogue = Annotated[Path, typer.Option(help="Folder with objects.csv and properties.yaml.")]
-Times = Annotated[float, typer.Option(help="A press begins at this many times the quiet level.")]
+Times = Annotated[float, typer.Option(min=1.0, help="A press begins at this many times the quiet level.")]
 Out = Annotated[Path, typer.Option(help="Folder of the videos.")]
 PHYSICLEAR = Path(__file__).parents[1] / "physiclear"
 
@@ -643,9 +643,12 @@ def studio(
     port: Annotated[int, typer.Option(help="Of 127.0.0.1.")] = 7860,
 ) -> None:
     """Show a page for a sensor on the desk: record presses, rate them, adapt the model, ask it. Nothing leaves."""
-    from pipeline.use.studio import serve_studio
+    from pipeline.use.studio import Studio, serve_studio
 
-    serve_studio(lambda copy: _load(copy or model, base, device), folder, camera, times, port)
+    def load(copy: str | None) -> Octopi:
+        return _load(copy or model, base, device)
+
+    serve_studio(lambda: Studio(load, folder, camera, times, newest=model is None), port)
 
 
 def _print_notes(notes: Sequence[str], heads: str = "") -> None:

@@ -181,7 +181,7 @@ def _rated(
         for place, (p, table) in enumerate(zip(catalogue.properties, read.evidence, strict=True))
     }
     told = _expected(read, labels, objects, catalogue.classes)
-    if not same:
+    if not (same and model.config.speaks):
         told += "\nIts language model knows other properties, and is not asked; heads alone answer."
     return Adapted(_tensors(read.heads), statistics, told, temperatures)
 

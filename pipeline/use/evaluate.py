@@ -47,7 +47,7 @@ def answers_about(
 
     Where embeddings are standardised, real videos are asked about twice: as they are, and standardised by their own
     mean and deviation, which takes no label. Another sensor shifts and scales embeddings. A model of other properties
-    or classes is asked nothing, since it has no words for these.
+    or classes is asked nothing, since it has no words for these, and neither is one whose heads alone answer.
 
     Args:
         parts: The part of the split that each object is in.
@@ -147,6 +147,9 @@ def _asking(octopi: Octopi, params: Params) -> Catalogue | None:
     )
     if known != wanted:
         logger.warning("%s is not asked: it knows %s, but %s has %s", octopi.name, known, params.data.catalogue, wanted)
+        return None
+    if not octopi.config.speaks:
+        logger.warning("%s is not asked: its heads alone answer", octopi.name)
         return None
     return catalogue.called("number" if octopi.numbered else "catalogue")
 

@@ -16,6 +16,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from itertools import zip_longest
 from pathlib import Path
+from types import MappingProxyType
 
 import yaml
 from pydantic import ValidationError
@@ -92,15 +93,16 @@ class RatedFolder:
         told = f"write one of up to {LONGEST_ID} letters, with its article, such as: a block of foam"
         raise UserError(f"{name[:LONGEST_ID]!r}: no name for an object; {told}")
 
-    def save(self, rows: Sequence[Row]) -> None:
+    def save(self, rows: Sequence[Row], called: Mapping[str, Row] = MappingProxyType({})) -> None:
         """Write ratings.csv, and objects.csv with each object that has a class of every property from somebody.
 
-        Names and other columns of objects.csv stay as they are; a new object is called by its id.
+        Names and other columns of objects.csv stay as they are, but for lines in `called` (by id); a new object is
+        called by its id.
         """
         self._write(RATINGS, ["object_id", "rater", *self.names], rows)
         file = self.catalogue / OBJECTS
         header, before = read_rows(file, ["object_id", "name"]) if file.exists() else ([], [])
-        old, lines = {row["object_id"]: row for _, row in before}, list[Row]()
+        old, lines = {row["object_id"]: row for _, row in before} | {**called}, list[Row]()
         for key in dict.fromkeys(row["object_id"] for row in rows):
             own = [row for row in rows if row["object_id"] == key]
             cells = {p: " ".join(row[p] for row in own if row.get(p)) for p in self.names}
@@ -113,6 +115,8 @@ class RatedFolder:
         if not rater or level not in {p.name: range(len(p.levels)) for p in self.properties}.get(property, ()):
             raise UserError(f"{rater!r}, {property}, {level}: no such rater, property or class; load the page anew")
         rows = self.ratings()
+        if object_id not in {row["object_id"] for row in rows} | {video.object_id for video in self.recorded()}:
+            raise UserError(f"{object_id}: no such object; load the page anew")
         row = next((row for row in rows if (row["object_id"], row["rater"]) == (object_id, rater)), Row())
         if not row:
             rows.append(row)
@@ -133,23 +137,34 @@ class RatedFolder:
         rows, videos, lines = self.ratings(), self.recorded(), self._read(OBJECTS, ["object_id", "name"])
         if new != old and new in {row["object_id"] for row in rows} | {video.object_id for video in videos}:
             raise UserError(f"{new}: is another object; give the videos to it one by one")
+        names = {line["object_id"]: line["name"] for line in lines}
+        line = next((line for line in lines if line["object_id"] == old), Row()) | {"object_id": new, "name": name}
+        named = [row | {"object_id": new} if row["object_id"] == old else row for row in rows]
+        if new != old:  # Rated under both names while its videos move, so that a kill leaves none unrated.
+            self.save([*rows, *(row for row in named if row["object_id"] == new)], {new: line})
         own = [video.file for video in videos if video.object_id == old != new]
         moved = {self.move(file, new, (files or {}).get(file, ""))[0]: file for file in own}
-        names = {line["object_id"]: line["name"] for line in lines}
-        lines = [line | {"object_id": new, "name": name} if line["object_id"] == old else line for line in lines]
-        if lines:
-            self._write(OBJECTS, lines[0], lines)
-        self.save([row | {"object_id": new} if row["object_id"] == old else row for row in rows])
+        self.save(named, {new: line})
         return names.get(old, old.replace("_", " ")), moved
 
     def agreement(self) -> dict[str, tuple[float, float, float] | None]:
-        """By property ICC(3,k) with its interval, over the objects that every rater rated; None where undefined."""
-        by = {(row["object_id"], row["rater"]): row for row in self.ratings()}
-        objects, raters = (list(dict.fromkeys(key[place] for key in by)) for place in (0, 1))
+        """By property ICC(3,k) with its interval; None where undefined.
+
+        It takes objects that each of its raters rated. Raters who rated few are left out where the others have more
+        ratings without them, so that who has just begun does not hide how those before agree.
+        """
         found = {}
         for p in self.names:
-            table = [[by.get((key, rater), {}).get(p) for rater in raters] for key in objects]
-            found[p] = icc3k([[int(level) for level in row if level] for row in table if all(row)])
+            by = dict[str, dict[str, int]]()
+            for row in self.ratings():
+                if row[p]:
+                    by.setdefault(row["rater"], {})[row["object_id"]] = int(row[p])
+            most = sorted(by.values(), key=len, reverse=True)
+            tables = [
+                [[own[key] for own in most[:count]] for key in most[0] if all(key in own for own in most[:count])]
+                for count in range(2, len(most) + 1)
+            ]
+            found[p] = icc3k(max(tables, key=lambda table: sum(map(len, table)), default=[]))
         return found
 
     def _read(self, name: str, needed: Sequence[str]) -> list[Row]:
@@ -200,8 +215,9 @@ class RatedFolder:
         self.known[now] = Recorded(file=now, object_id=to, session=row.session)
         target = self.videos / now
         target.parent.mkdir(parents=True, exist_ok=True)
-        for suffix in (".csv", source.suffix):  # The times first, so that no video is without them.
-            if source.with_suffix(suffix).is_file():
-                os.replace(source.with_suffix(suffix), target.with_suffix(suffix))
+        if (timed := source.with_suffix(".csv")).is_file():  # There twice for a moment: no video is without its times.
+            shutil.copyfile(timed, target.with_suffix(".csv"))
+        os.replace(source, target)
+        timed.unlink(missing_ok=True)
         self.list_videos()
         return now, row.object_id

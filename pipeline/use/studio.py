@@ -85,6 +85,9 @@ class Sensor:
     def _shots(self) -> Iterator[Shot]:
         """The camera's pictures; a file's come when they came to the camera that recorded it."""
         begin = time.monotonic() if Path(self.camera).is_file() else None
+        self.stamps.clear()  # A camera that comes back dropped no pictures meanwhile, and may have another format.
+        self.quiet.clear()
+        self.last = self.strongest = None
         for shot in watch(self.camera, lambda rate: setattr(self, "promised", rate)):
             if self.stop.wait(max(0.0, begin + shot.stamped / 1e9 - time.monotonic()) if begin else 0):
                 return
@@ -139,7 +142,7 @@ class Sensor:
             found["the light still changes; wait"] = True
         elif len(quiet) == LONGEST:
             now = mean([seen.thumb for seen in quiet])
-            self.gel = self.gel or [now]
+            self.gel = [gel for gel in self.gel if gel.shape == now.shape] or [now]
             light = float(now[:, :, 0].mean()) - float(self.gel[0][:, :, 0].mean())
             drift = contact_strength(now, self.gel[0]) > quiet[-1].threshold
             found[f"the light has changed by {light:+.0f} of 255 since the start"] = abs(light) > STEP
@@ -156,11 +159,12 @@ class Sensor:
             "notes": self.notes(),
             "curve": [*self.curve],
         }
-        if self.last is not None:
-            pictures = [seen.shot.picture[:, :, ::-1] for seen in (self.last, *[*self.quiet][:LONGEST])]
+        last, quiet = self.last, [*self.quiet][:LONGEST]
+        if last and quiet and last.shot.picture.shape == quiet[0].shot.picture.shape:  # Else it is being opened anew.
+            pictures = [seen.shot.picture[:, :, ::-1] for seen in (last, *quiet)]
             scale = WIDTH / pictures[0].shape[1]
             picture, *before = (cv2.resize(shown, None, fx=scale, fy=scale) for shown in pictures)
-            told |= {"picture": uri(picture, "jpeg"), "pressed": self.last.state == "pressed"}
+            told |= {"picture": uri(picture, "jpeg"), "pressed": last.state == "pressed"}
             told["difference"] = uri(subtract(picture[None], mean(before))[0], "jpeg")
         return told
 
@@ -168,11 +172,16 @@ class Sensor:
 class Studio(Session):
     """The demo's session with a camera and a folder: one thread watches, one writes videos, one holds the model."""
 
-    def __init__(self, load: Callable[[str | None], Octopi], folder: Path, camera: str, times: float) -> None:
-        """Open or make the folder; `load` gives the model of a folder, or for None the one that is adapted."""
+    def __init__(
+        self, load: Callable[[str | None], Octopi], folder: Path, camera: str, times: float, *, newest: bool = True
+    ) -> None:
+        """Open or make the folder; `load` gives the model of a folder, or for None the one that is adapted.
+
+        Until it is adapted again, the `newest` copy that the folder has is asked, or the one that is adapted.
+        """
         self.data = RatedFolder(folder, Path(__file__).parents[1] / "physiclear" / PROPERTIES)
         self.load, self.times, self.copies = load, times, folder / "models"
-        model = load(max((str(copy) for copy in self.copies.glob("[0-9]*")), default=None))
+        model = load(max((str(copy) for copy in self.copies.glob("[0-9]*") if newest), default=None))
         super().__init__(model, model.catalogue, {})
         self.session, self.target, self.told, self.busy = time.strftime("%Y-%m-%d %H:%M"), "", "", ""
         self.events, self.undos = list[dict[str, str]](), list[Callable[[], object]]()
@@ -251,12 +260,15 @@ class Studio(Session):
     # ---- rate ----
 
     def state(self, rater: str = "") -> dict[str, Any]:
-        """What is in the folder, and one rater's ratings; those of all only for who has rated every object."""
-        rows, videos = self.data.ratings(), self.data.recorded()
+        """What is in the folder, and one rater's ratings; those of all only for who has rated every object.
+
+        An object without videos is not shown: there is nothing to rate. Its ratings stay in the folder.
+        """
+        videos = self.data.recorded()
+        shown = {video.object_id for video in videos} - {"unknown"}
+        rows = [row for row in self.data.ratings() if row["object_id"] in shown]
         own = [row for row in rows if row["rater"] == rater]
-        blind = sum(all(row.values()) for row in own) < len(
-            {row["object_id"] for row in rows} | {video.object_id for video in videos} - {"unknown"}
-        )
+        blind = sum(all(row.values()) for row in own) < len(shown)
         return {
             "folder": str(self.data.videos.parent),
             "videos": [video.model_dump() for video in videos],
@@ -334,7 +346,7 @@ def make_studio(studio: Studio, token: str) -> FastAPI:
     return make_app(studio, routes, token)
 
 
-def serve_studio(load: Callable[[str | None], Octopi], folder: Path, camera: str, times: float, port: int) -> None:
+def serve_studio(make: Callable[[], Studio], port: int) -> None:
     """Show the studio until it is interrupted; the address that is printed has the token that lets the page in.
 
     Raises:
@@ -342,7 +354,7 @@ def serve_studio(load: Callable[[str | None], Octopi], folder: Path, camera: str
     """
     with listen("127.0.0.1", port) as listening:
         token = secrets.token_urlsafe()
-        app = make_studio(Studio(load, folder, camera, times), token)
+        app = make_studio(make(), token)
         address = f"http://127.0.0.1:{listening.getsockname()[1]}/studio.html#{token}"
         print(f"{address} shows the studio; Ctrl-C ends it", flush=True)
         with suppress(KeyboardInterrupt):

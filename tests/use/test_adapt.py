@@ -125,6 +125,8 @@ def test_with_ratings_heads_know_them(octopi: Octopi, catalogue: Catalogue, tmp_
     if other:
         with refused("knows other properties"):
             mine.ask("Is it soft?", VIDEOS[0])
+    again = adapt(mine, [*found], tmp_path / "again", catalogue=ratings, objects=[*found.values()])
+    assert ("heads alone answer" in again) is other, "a copy of a copy says it, too"
 
 
 @pytest.mark.slow

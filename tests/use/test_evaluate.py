@@ -247,3 +247,11 @@ def test_it_is_not_asked_about_properties_or_classes_of_others(
     params = compose("smoke", ["evaluate.questions=4", f"data.catalogue={ROOT}/pipeline/physiclear"], ROOT / "conf")
     assert answers_about(cast(Octopi, model), params, fake_videos(["rug"]), {}) == []
     assert re.search(r"octopi-small is not asked: .*(warmth: soft|yielding).*, but .*hardness: soft", caplog.text)
+
+
+def test_a_copy_whose_heads_alone_answer_is_not_asked(catalogue: Catalogue, caplog: pytest.LogCaptureFixture) -> None:
+    """It knows the properties, as heads were fitted to them, but its language model does not."""
+    model = SimpleNamespace(catalogue=catalogue, config=SimpleNamespace(speaks=False), name="mine")
+    params = compose("smoke", [f"data.catalogue={ROOT}/pipeline/physiclear"], ROOT / "conf")
+    assert answers_about(cast(Octopi, model), params, fake_videos(["rug"]), {}) == []
+    assert "mine is not asked: its heads alone answer" in caplog.text

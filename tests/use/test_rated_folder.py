@@ -1,10 +1,12 @@
 """The folder that the studio fills: read by the catalogue's own reader, and nothing is lost on the way."""
 
+import os
 import threading
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -67,13 +69,19 @@ def test_what_raters_say_is_a_catalogue_that_the_chain_trains_on(tmp_path: Path)
 
 
 def test_agreement_is_over_objects_that_all_have_rated(tmp_path: Path) -> None:
-    data, given = opened(tmp_path), {"ann": (0, 1, 2, 2), "ben": (0, 2, 1, 2), "cid": (1, 1, 2, 2)}
+    data = opened(tmp_path, *(f"{key}_0.mp4" for key in ("a", "b", "c", "d", "what_ann_alone_rated")))
+    given = {"ann": (0, 1, 2, 2), "ben": (0, 2, 1, 2), "cid": (1, 1, 2, 2)}
     for rater, levels in given.items():
         for key, level in zip("abcd", levels, strict=True):
             rate(data, rater, key, hardness=level)
     rate(data, "ann", "what_ann_alone_rated", hardness=2)
     none = "roughness", "bumpiness"  # Where nothing differs.
-    assert data.agreement() == {"hardness": icc3k([*zip(*given.values(), strict=True)]), **dict.fromkeys(none)}
+    agreed = {"hardness": icc3k([*zip(*given.values(), strict=True)]), **dict.fromkeys(none)}
+    assert data.agreement() == agreed
+    rate(data, "dan", "b", hardness=0)
+    assert data.agreement() == agreed, "who has just begun hides nothing"
+    with refused("no such object"):  # It has another name now, on another page.
+        data.rate("ann", "e", "hardness", 1)
 
 
 def test_a_folder_written_by_hand_stays_as_it_is(tmp_path: Path) -> None:
@@ -128,6 +136,35 @@ def test_videos_move_come_back_and_survive_a_kill(tmp_path: Path) -> None:
     assert [row.file for row in opened(tmp_path).recorded()] == ["foam_1.mp4", "foam_7.mp4"]
     assert [row.file for row in read_csv(listed, Recorded)] == ["foam_1.mp4", "foam_7.mp4"]
     assert not rest.exists()
+
+
+@pytest.mark.parametrize("writes", range(9))
+def test_a_new_name_that_is_killed_loses_no_rating_and_no_times(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, writes: int
+) -> None:
+    data, done = opened(tmp_path, "foam_0.mp4", "foam_1.mp4"), list[str]()
+    for file in ("foam_0.csv", "foam_1.csv"):
+        (data.videos / file).write_text("frame\n0\n")
+    for rater in ("ann", "ben"):
+        rate(data, rater, "foam")
+    replace = os.replace
+
+    def killed(source: str, target: str) -> None:
+        if len(done) == writes:
+            raise KeyboardInterrupt
+        done.append(target)
+        replace(source, target)
+
+    with monkeypatch.context() as patch, suppress(KeyboardInterrupt):
+        patch.setattr(os, "replace", killed)
+        data.rename("foam", "sponge", "a sponge")
+    again = RatedFolder(tmp_path, PROPERTIES)
+    videos, found = again.recorded(), load_catalogue(again.catalogue).objects
+    assert len(videos) == 2
+    assert all((again.videos / video.file).with_suffix(".csv").exists() for video in videos)
+    raters = {row["rater"] for row in again.ratings() if row["object_id"] in {v.object_id for v in videos}}
+    assert raters == {"ann", "ben"}
+    assert {found[key].ratings for key in {v.object_id for v in videos} & found.keys()} == {((0, 0), (2, 2), (1, 1))}
 
 
 @settings(max_examples=40)

@@ -14,6 +14,7 @@ from pipeline.use import live, studio
 from pipeline.use.studio import Sensor
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.film import write_film
+from pipeline.videos.frames.reference import LONGEST
 from pipeline.videos.importing.presses import Shot
 from tests.checkpoints import model_folder
 from tests.conftest import wait_for
@@ -39,7 +40,8 @@ def test_what_is_odd_about_camera_gel_and_press_is_said(monkeypatch: pytest.Monk
 
     def plugged(name: object) -> Camera:
         light = [np.clip(picture.astype(int) + 20, 0, 255).astype(np.uint8) for picture in pictures[:25]]
-        opened.append(Slow([*pictures[:80], *weak, *pictures[:15], *pictures[80:]] if not opened else light, name))
+        films = [*pictures[:80], *weak, *pictures[:15], *pictures[80:]], 3 * light, [p[:-16].copy() for p in 3 * light]
+        opened.append(Slow(films[min(len(opened), 2)], name))
         return opened[-1]
 
     monkeypatch.setattr(cv2, "VideoCapture", plugged)
@@ -47,8 +49,12 @@ def test_what_is_odd_about_camera_gel_and_press_is_said(monkeypatch: pytest.Monk
     monkeypatch.setattr(studio, "AGAIN", 0.1)
     sensor = Sensor("0", 2.0, lambda odd, press: told.append((odd, press)))
     wait_for(lambda: any("says 60" in note for note in sensor.notes()))
-    wait_for(lambda: len(opened) > 1)
+    wait_for(lambda: sensor.notes() and sensor.gel and len(opened) > 1)
     wait_for(lambda: any("changed by +" in note for note in sensor.notes()))
+    assert not any("dropped" in note for note in sensor.notes()), "while it was gone it sent none"
+    wait_for(lambda: len(opened) > 2 and sensor.quiet and sensor.quiet[-1].shot.picture.shape[0] < len(pictures[0]))
+    wait_for(lambda: "picture" in sensor.shown() and len(sensor.quiet) >= LONGEST)
+    assert not any("changed" in note for note in sensor.notes()), "in another format it is compared with itself"
     sensor.close()
     found = [(odd.partition(":")[0].partition(",")[0], bool(press)) for odd, press in told]
     assert found == [("", True), ("too weak", False), ("too short", False), ("cut off before the release", True)]
@@ -103,6 +109,25 @@ def test_record_rate_adapt_and_ask_in_a_browser(tmp_path: Path) -> None:
             page.until("document.querySelector('#told').textContent.includes('3 rated objects (3 videos)')")
             submit(page, "document.querySelector('#camera')", str(camera))
             page.until("document.querySelector('.touch .sentence') && document.querySelectorAll('.bar').length === 9")
+            assert "unknown_0.mp4" in page.run("document.querySelector('#lately').textContent")
+            choose = "(s => {{ s.value = '{}'; s.dispatchEvent(new Event('change')) }})({})".format
+            page.run(choose("foam_0.mp4", "document.querySelector('#again')"))
+            page.until("document.querySelectorAll('.touch .sentence').length === 2")
+            page.run("document.querySelector('#both').click()")
+            page.until("document.querySelectorAll('#compared tr').length === 3")
+            page.type("#question", "Which is softer?")
+            page.until("document.querySelector('.model') && !document.querySelector('#send').disabled")
+            page.run("document.querySelector('[data-part=record]').click(); window.prompt = () => 'a big brick'")
+            rename = "[...document.querySelectorAll('.object')].find(o => o.textContent.startsWith('brick'))"
+            page.run(f"[...{rename}.querySelectorAll('button')].find(b => b.textContent === 'rename').click()")
+            chips = "[...document.querySelectorAll('.chip')].map(c => c.firstChild.textContent).sort().join()"
+            page.until(f"{chips} === 'a_big_brick_0,foam_0,toy_brick_0,unknown_0'")
+            unknown = "[...document.querySelectorAll('.chip')].find(c => c.textContent.startsWith('unk'))"
+            page.run(choose("foam", f"{unknown}.querySelector('select')"))
+            page.until(f"{chips} === 'a_big_brick_0,foam_0,foam_1,toy_brick_0'")
+            for shown in ("a_big_brick_0,foam_0,toy_brick_0,unknown_0", "brick_0,foam_0,toy_brick_0,unknown_0"):
+                page.run("document.querySelector('#undo').click()")
+                page.until(f"{chips} === '{shown}'")
             assert page.complaints() == []
         ratings = {key: [*zip(c, c, strict=True)] for key, c in CLASSES.items()} | {"foam": [(0, 1), (1, 1), (0, 0)]}
         found = load_catalogue(lab / "catalogue").objects

@@ -93,7 +93,8 @@ function drawRecorded() {
 // ---- rate ----
 
 async function film(file, frame, difference) {
-  if (!films.has(file)) films.set(file, call(`api/frames/${encodeURIComponent(file)}`).then(r => r.ok ? r.json() : null));
+  const ask = () => call(`api/frames/${encodeURIComponent(file)}`).then(r => r.ok ? r.json() : null).catch(() => null);
+  if (!films.has(file)) films.set(file, ask());
   const shown = await films.get(file);
   if (!shown) return films.delete(file);
   let turn = 0;
@@ -114,13 +115,19 @@ function slider(object, property) {
   input.classList.toggle("unset", !level);
   show(level);
   // A click on an unset slider's own place changes nothing, and counts all the same.
-  const rate = () => {
+  const rate = async () => {
     if (!rater()) return tell("Write your name first: raters do not see each other's ratings.");
     if (object.own[property.name] === input.value) return;
-    object.own = {...object.own, [property.name]: input.value};
+    const before = object.own;
+    object.own = {...before, [property.name]: input.value};
     input.classList.remove("unset");
     show(input.value);
-    act("rate", {rater: rater(), object_id: object.id, property: property.name, level: Number(input.value)});
+    const given = {rater: rater(), object_id: object.id, property: property.name, level: Number(input.value)};
+    if (await act("rate", given) !== undefined) return;
+    object.own = before;  // It is not written down, so it is not shown, and the next click sends it again.
+    input.value = before[property.name] || 0;
+    input.classList.toggle("unset", !before[property.name]);
+    show(before[property.name]);
   };
   input.addEventListener("input", () => show(input.value));
   for (const kind of ["change", "click"]) input.addEventListener(kind, rate);
@@ -208,7 +215,11 @@ function drawSummary() {
 
 async function listen() {
   try {
-    const live = await (await call("api/live")).json();
+    const response = await call("api/live"), live = response.ok ? await response.json() : null;
+    if (response.status === 401) {
+      $("gone").textContent = "The studio was started anew; open the address that it shows now.";
+      return;
+    }
     draw_sensor(live);
     if (heard !== null && live.said > heard) {
       await refresh();
@@ -237,6 +248,7 @@ function draw_sensor(live) {
   $("rate-of").textContent = live.rate ? `${live.rate.toFixed(1)} pictures a second` : "";
   $("notes").replaceChildren(...live.notes.map(note => make("li", "", note)));
   $("events").replaceChildren(...live.events.slice(-5).reverse().map(e => make("li", "", e.text)));
+  $("lately").textContent = [live.gone, live.events.at(-1)?.text].filter(Boolean).join("; ");
   $("target").textContent = live.target ? `Press it now: each press is recorded as ${live.target}_NUMBER.mp4`
     : "Nothing is recorded: name the object.";
   $("busy").textContent = live.busy;
