@@ -228,9 +228,9 @@ def bag(
 ) -> None:
     """Cut a robot's recording into presses: videos for the chain and `octopi ask`, each with its times in a CSV."""
     from pipeline.videos.importing.bags import shots
-    from pipeline.videos.importing.presses import cut
+    from pipeline.videos.importing.presses import cut_into
 
-    written = cut(lambda: shots(file, topic), f"{file}, {topic}", out, object_id or file.stem, times)
+    written = cut_into(lambda: shots(file, topic), f"{file}, {topic}", out, object_id or file.stem, times)
     typer.echo(f"{len(written)} presses in {out}: {', '.join(path.name for path in written)}")
 
 
@@ -249,12 +249,12 @@ def video(
 
     A table (file, object_id, begin and end in seconds, session) says itself where to cut: one video a line.
     """
-    from pipeline.videos.importing.presses import cut, cut_listed, film
+    from pipeline.videos.importing.presses import cut_into, cut_listed, film
 
     if file.suffix.lower() == ".csv":
         written = cut_listed(file, out, fps)
     else:
-        written = cut(lambda: film(file, fps), str(file), out, object_id or file.stem, times, whole=whole)
+        written = cut_into(lambda: film(file, fps), str(file), out, object_id or file.stem, times, whole=whole)
     typer.echo(f"{counted(len(written), 'video')} in {out}: {', '.join(path.name for path in written)}")
 
 

@@ -7,6 +7,7 @@ more than the first plane; turning a frame into BGR costs as much as decoding it
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -35,8 +36,16 @@ FULL_RANGE, BT709 = 2, 1
 """As FFmpeg numbers colour ranges and colour spaces."""
 HDR = (16, 18)
 """PQ and HLG, as ITU-T H.273 numbers transfer characteristics."""
-REFORMATTER = VideoReformatter()
-"""One a process: it keeps its tables from frame to frame."""
+
+
+class _Own(threading.local):
+    """What a thread has to itself: a reformatter keeps its tables from frame to frame, so two must not share one."""
+
+    def __init__(self) -> None:
+        self.reformatter = VideoReformatter()
+
+
+_own = _Own()
 
 
 @dataclass(frozen=True)
@@ -207,4 +216,4 @@ def _colours(full: bool, bt709: bool) -> npt.NDArray[np.float64]:
 
 def _reformat(frame: av.VideoFrame, pixels: str, width: int | None = None, height: int | None = None) -> av.VideoFrame:
     """Convert in one thread: a forked process lacks the threads of its parent, but would wait for them for ever."""
-    return REFORMATTER.reformat(frame, width, height, format=pixels, threads=1)
+    return _own.reformatter.reformat(frame, width, height, format=pixels, threads=1)

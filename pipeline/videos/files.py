@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import posixpath
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
+from pipeline.core.io import atomic
 from pipeline.running.errors import UserError, readable
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.catalogue.csv_reader import read_rows
@@ -90,6 +92,35 @@ def list_videos(folder: Path, catalogue: Catalogue) -> Listing:
         if others:
             findings.append(_error(first, f"{video_id} is also {', '.join(others)}; keep one of them"))
     return Listing(tuple(files), tuple(findings), tuple(sorted(unknown)))
+
+
+def check_extensible(folder: Path) -> None:
+    """Raise UserError where a folder's videos.csv is unreadable, or a table of sections, which lines would spoil."""
+    listed = folder / LIST_FILE
+    if listed.is_file() and {*SECTION} & {*read_rows(listed, ("file", "object_id"))[0]}:
+        raise UserError(f"{listed}: names sections of files, and would be lost; name another --out")
+
+
+def add_to_list(folder: Path, rows: Sequence[Mapping[str, str]]) -> None:
+    """Add new videos to a folder's videos.csv, of which the chain takes the files alone; all its columns stay.
+
+    A folder without one gets it where a line says more than its file's name does, with older videos by their names.
+    """
+    listed, columns = folder / LIST_FILE, ["file", "object_id"]
+    if listed.is_file():
+        header, found = read_rows(listed, columns)
+        before = [row for _, row in found]
+    elif any(value for row in rows for key, value in row.items() if key not in columns):
+        new = {row["file"] for row in rows}
+        older = [file for file in _from_names(folder, video_files(folder)[0])[0] if file.relative not in new]
+        header, before = columns, [{"file": file.relative, "object_id": file.object_id} for file in older]
+    else:
+        return
+    with atomic(listed) as part, part.open("w", encoding="utf-8", newline="") as stream:
+        fields = dict.fromkeys([*header, *(key for row in rows for key in row)])
+        writer = csv.DictWriter(stream, fields, restval="", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows([*before, *rows])
 
 
 def raise_errors(folder: Path, findings: Sequence[Finding]) -> None:

@@ -1,7 +1,7 @@
 """Recordings cut into presses: bags of both ROS versions, long videos, folders of pictures."""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 from tempfile import mkdtemp
@@ -14,13 +14,14 @@ import pytest
 
 from pipeline.config import FramesConfig
 from pipeline.core.io import read_csv
+from pipeline.running.errors import UserError
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.decoding import Decoder
 from pipeline.videos.files import list_videos
 from pipeline.videos.film import write_film
 from pipeline.videos.frames.reference import LONGEST
 from pipeline.videos.importing.bags import shots
-from pipeline.videos.importing.presses import SHORTEST, FrameTime, cut, film, presses
+from pipeline.videos.importing.presses import SHORTEST, FrameTime, Shot, cut, film, presses
 from pipeline.videos.records import Severity
 from tests.conftest import octopi, refused
 from tests.frame_rules import decode, scanned
@@ -313,3 +314,20 @@ def test_a_table_says_where_to_cut(tmp_path: Path, pictures: list[np.ndarray], c
     with refused("names sections of files, and would be lost; name another --out"):
         octopi("import", "video", table, "--out", tmp_path)
     assert len([*out.glob("*.mp4")]) == 4, "nothing is written where a line is wrong"
+    octopi("import", "video", tmp_path / "long.mp4", "--out", out, "--object", "rug", "--whole")
+    assert "rug_3.mp4" in [f.relative for f in list_videos(out, catalogue).files], "the list goes on"
+
+
+def test_presses_are_written_all_or_none(tmp_path: Path, pictures: list[np.ndarray]) -> None:
+    """So that who begins anew after an error or a kill has none twice."""
+    calls = iter([LENGTH, TOUCHED[1].start])
+
+    def read() -> Iterator[Shot]:
+        end = next(calls)
+        yield from (Shot(picture, place * STEP_NS, place * STEP_NS) for place, picture in enumerate(pictures[:end]))
+        if end < LENGTH:
+            raise UserError("the rest cannot be read")
+
+    with refused("the rest cannot be read"):
+        cut(read, "it", tmp_path, "rug")
+    assert [*tmp_path.iterdir()] == []

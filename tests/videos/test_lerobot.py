@@ -48,7 +48,7 @@ def test_episodes_are_copied_to_the_frame(layout: str, tmp_path: Path) -> None:
     listed = pd.read_csv(tmp_path / GEL / "videos.csv").values.tolist()
     for name, row, episode in zip(NAMES, listed, expected(layout), strict=True):
         place, number, length = episode["videos"][GEL], episode["episode_index"], episode["length"]
-        session = f"{layout} episode {number} ({place['from']:.3f} to {place['to']:.3f} s)"
+        session = f"{DATASETS.name}/{layout} episode {number} ({place['from']:.3f} to {place['to']:.3f} s)"
         assert row == [f"{name}.mp4", name[:-2], session, GEL]
         first, video = place["first_frame_in_file"], tmp_path / GEL / f"{name}.mp4"
         assert packets(video) == packets(DATASETS / layout / place["file"])[first : first + length]
@@ -68,6 +68,23 @@ def test_a_second_call_keeps_what_a_person_added(layout: str, tmp_path: Path, ca
     assert pd.read_csv(listed, keep_default_na=False).note.tolist() == ["a, b", "", "", ""]
     assert import_episodes(DATASETS / layout, GEL, out, None, 4.0, pressed=False) == []
     assert len(import_episodes(DATASETS / layout, WRIST, out, None, 4.0, pressed=False)) == 4
+
+
+@by_layout
+def test_it_goes_on_in_a_folder_that_has_videos(layout: str, tmp_path: Path) -> None:
+    """With a list as the studio writes it, and without one: the chain takes old videos and new ones."""
+    for folder in ((with_list := tmp_path / "listed"), tmp_path / "plain"):
+        import_episodes(DATASETS / layout, GEL, folder, None, 4.0, pressed=False)
+        (folder / "press_the_mug_0.mp4").rename(folder / "mug_7.mp4")
+        for name in (NAMES[0], NAMES[2], NAMES[3]):
+            (folder / f"{name}.mp4").unlink()
+        (folder / "videos.csv").unlink()
+    (with_list / "videos.csv").write_text("file,object_id,session\nmug_7.mp4,mug,monday\n")
+    for folder, session in ((with_list, "monday"), (tmp_path / "plain", "")):
+        import_episodes(DATASETS / layout, GEL, folder, None, 4.0, pressed=False)
+        listed = pd.read_csv(folder / "videos.csv", keep_default_na=False)
+        assert listed.file.tolist() == ["mug_7.mp4", *(f"{name}.mp4" for name in NAMES)]
+        assert listed.session[0] == session
 
 
 def numbers(video: Path) -> list[int]:

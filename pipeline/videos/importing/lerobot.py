@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import logging
 import os
@@ -16,17 +15,15 @@ from typing import Any
 import av
 import pandas as pd
 
-from pipeline.core.io import atomic, remove_rests
+from pipeline.core.io import remove_rests
 from pipeline.running.errors import UserError, counted, did_you_mean
-from pipeline.videos.catalogue.csv_reader import Row, read_rows
+from pipeline.videos.catalogue.csv_reader import read_rows
 from pipeline.videos.decoding import CONTAINERS, video_stream
-from pipeline.videos.files import LIST_FILE
+from pipeline.videos.files import LIST_FILE, add_to_list, check_extensible
 from pipeline.videos.importing.presses import NothingTouchesError, cut, film, first_free
 
 log = logging.getLogger(__name__)
 
-COLUMNS = ["file", "object_id", "session", "video"]
-"""Of the `videos.csv` beside imported episodes; `video` is the camera's key in the dataset."""
 PLACE = ("chunk_index", "file_index", "from_timestamp")
 """Where v3.0 keeps an episode's video; the numbers of a file's folder and of the file, and seconds in it."""
 REORDERED = 16
@@ -52,6 +49,8 @@ def import_episodes(
 ) -> list[Path]:
     """Write each episode's video as `<object_id>_<n>.mp4`, with a `videos.csv`; a second call goes on in it.
 
+    Its column `video` is the camera's key in the dataset.
+
     A video is copied without being encoded anew where no frame outside of the episode comes along, else cut.
 
     Args:
@@ -67,9 +66,9 @@ def import_episodes(
     """
     found = read_episodes(root, key)
     names, listed = _object_ids(root, found, objects), out / LIST_FILE
-    header, lines = read_rows(listed, COLUMNS) if listed.exists() else (COLUMNS, [])
-    rows = [row for _, row in lines]
-    known = {row["session"] for row in rows if row["video"] == key}
+    check_extensible(out)
+    lines = [row for _, row in read_rows(listed, ("file", "object_id"))[1]] if listed.exists() else []
+    known = {row["session"] for row in lines if row.get("video") == key and "session" in row}
     if known:
         log.warning("%s: lists %s already; they stay as they are", listed, counted(len(known), "episode"))
     out.mkdir(parents=True, exist_ok=True)
@@ -92,12 +91,8 @@ def import_episodes(
             continue
         finally:
             part.unlink(missing_ok=True)
-        for video in videos:
-            rows.append(Row(file=video.name, object_id=object_id, session=episode.session, video=key))
-        with atomic(listed) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
-            writer = csv.DictWriter(stream, header, lineterminator="\n")  # With the columns that a person added.
-            writer.writeheader()
-            writer.writerows(rows)
+        same = {"object_id": object_id, "session": episode.session, "video": key}
+        add_to_list(out, [{"file": video.name} | same for video in videos])
         written += videos
     return written
 
@@ -128,7 +123,8 @@ def read_episodes(root: Path, key: str) -> list[Episode]:
             place = {name: row.get(f"videos/{key}/{name}", 0) for name in PLACE}
             place |= {"video_key": key, "episode_index": number, "episode_chunk": number // info["chunks_size"]}
             video, begin = root / info["video_path"].format(**place), place["from_timestamp"]
-            session = f"{root.resolve().name} episode {number} ({begin:.3f} to {begin + length / fps:.3f} s)"
+            name = "/".join(root.resolve().parts[-2:])  # USER/NAME, as LeRobot stores them.
+            session = f"{name} episode {number} ({begin:.3f} to {begin + length / fps:.3f} s)"
             # Times are running sums, which comparing would take a frame too many or too few by.
             first = round(begin * fps)
             task = " ".join(row["tasks"]).strip()

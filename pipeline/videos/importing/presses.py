@@ -26,9 +26,9 @@ from pipeline.core.records import Record
 from pipeline.running.errors import UserError
 from pipeline.videos import decoding
 from pipeline.videos.audit.files import FOUND
-from pipeline.videos.catalogue.csv_reader import read_rows
+from pipeline.videos.catalogue.csv_reader import Row, read_rows
 from pipeline.videos.decoding import Decoder, Image
-from pipeline.videos.files import LIST_FILE, SECTION, is_video
+from pipeline.videos.files import SECTION, add_to_list, check_extensible, is_video
 from pipeline.videos.film import write_film
 from pipeline.videos.frames.reference import (
     LONGEST,
@@ -132,26 +132,40 @@ def cut(
     fps = _rate(name, stamped, received)
     out.mkdir(parents=True, exist_ok=True)
     remove_rests(out)
-    source, position, written = read(), 0, []
-    for number, (begin, end) in enumerate(ranges, first_free(out, object_id)):
-        path = out / f"{object_id}_{number}.mp4"
-        pressed = itertools.islice(source, begin - position, end - position)
-        position = end
-        rows = [
-            FrameTime(
-                frame=i - begin, recorded_ns=received[i], stamped_ns=stamped[i], contact=round(float(strengths[i]), 3)
-            )
-            for i in range(begin, end)
-        ]
-        # The suffix says the container, so the unfinished file bears it, too.
-        part = path.with_name(f".{path.stem}.{os.getpid()}.part.mp4")
-        try:
-            write_film(part, (shot.picture for shot in pressed), fps)
+    source, position, parts = read(), 0, dict[Path, Path]()
+    try:
+        for number, (begin, end) in enumerate(ranges, first_free(out, object_id)):
+            path = out / f"{object_id}_{number}.mp4"
+            # The suffix says the container, so the unfinished file bears it, too.
+            parts[path] = path.with_name(f".{path.stem}.{os.getpid()}.part.mp4")
+            pressed = itertools.islice(source, begin - position, end - position)
+            write_film(parts[path], (shot.picture for shot in pressed), fps)
+            position = end
+        for (path, part), (begin, end) in zip(parts.items(), ranges, strict=True):  # All or none, for who begins anew.
+            rows = [
+                FrameTime(
+                    frame=i - begin,
+                    recorded_ns=received[i],
+                    stamped_ns=stamped[i],
+                    contact=round(float(strengths[i]), 3),
+                )
+                for i in range(begin, end)
+            ]
             write_csv(path.with_suffix(".csv"), FrameTime, rows)
             os.replace(part, path)
-        finally:
+    finally:
+        for part in parts.values():
             part.unlink(missing_ok=True)
-        written.append(path)
+    return [*parts]
+
+
+def cut_into(
+    read: Callable[[], Iterator[Shot]], name: str, out: Path, object_id: str, times: float, *, whole: bool = False
+) -> list[Path]:
+    """As `cut`, into a folder whose list, where it has one, goes on."""
+    check_extensible(out)
+    written = cut(read, name, out, object_id, times, whole=whole)
+    add_to_list(out, [{"file": path.name, "object_id": object_id} for path in written])
     return written
 
 
@@ -162,9 +176,7 @@ def first_free(out: Path, object_id: str) -> int:
 
 
 def cut_listed(listed: Path, out: Path, fps: float = 0.0) -> list[Path]:
-    """Write what each line of a table names as one video, with a `videos.csv` beside them where sessions are known.
-
-    A list that is there already goes on, as a folder with a list has its files alone.
+    """Write what each line of a table names as one video, with the table's other columns in a `videos.csv` beside them.
 
     Args:
         listed: CSV with the columns `file` (from the table's folder), `object_id`, and, where wanted, `begin` and `end`
@@ -174,22 +186,18 @@ def cut_listed(listed: Path, out: Path, fps: float = 0.0) -> list[Path]:
     Raises:
         UserError: as of `cut`, or where the folder's list is a table of sections.
     """
-    header, rows = read_rows(listed, ("file", "object_id"))
-    before, known = read_rows(out / LIST_FILE, ("file", "object_id")) if (out / LIST_FILE).is_file() else ([], [])
-    if {*SECTION} & {*before}:
-        raise UserError(f"{out / LIST_FILE}: names sections of files, and would be lost; name another --out")
+    _, rows = read_rows(listed, ("file", "object_id"))
+    check_extensible(out)
     sections = [[_seconds(where, column, row.get(column, "")) for column in SECTION] for where, row in rows]
-    written, sessions = list[Path](), [row for _, row in known]
+    written, lines = list[Path](), list[Row]()
     for (where, row), (begin, end) in zip(rows, sections, strict=True):
         read = partial(film, listed.parent / row["file"], fps, begin or 0.0, end)
         (path,) = cut(read, where, out, row["object_id"], whole=True)
         written.append(path)
-        sessions.append({"session": "", **row, "file": path.name})
-    if known or "session" in header:
-        fields = Recorded.model_fields
-        write_csv(
-            out / LIST_FILE, Recorded, [Recorded(**{key: row.get(key, "") for key in fields}) for row in sessions]
-        )
+        lines.append({**row, "file": path.name})
+        for key in SECTION:
+            lines[-1].pop(key, None)
+    add_to_list(out, lines)
     return written
 
 
