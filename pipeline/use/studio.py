@@ -33,7 +33,7 @@ from pipeline.videos.catalogue import PROPERTIES, load_catalogue
 from pipeline.videos.decoding import Image
 from pipeline.videos.frames.reference import LONGEST, contact_strength, is_steady, mean
 from pipeline.videos.frames.subtraction import subtract
-from pipeline.videos.importing.presses import RELEASED, SHORTEST, Recorded, Shot, cut
+from pipeline.videos.importing.presses import RELEASED, SHORTEST, Shot, cut
 
 if TYPE_CHECKING:
     from pipeline.use.model import Octopi
@@ -210,7 +210,7 @@ class Studio(Session):
                 with self.lock:
                     (path,) = cut(lambda: iter(press), self.sensor.camera, self.data.videos, target, whole=True)
                     file = path.name
-                    self.data.known[file] = Recorded(file=file, object_id=target, session=self.session)
+                    self.data.known[file] = {"file": file, "object_id": target, "session": self.session}
                     self.data.list_videos()
                     self.undos.append(lambda: self.data.move(file, ""))
                 said = ": ".join(filter(None, (file, odd)))
@@ -220,8 +220,9 @@ class Studio(Session):
 
     def connect(self, camera: Text) -> None:
         """Watch another camera, or the same one with its gel as it is now, or a file from its beginning."""
-        self.sensor.close()
-        self.sensor = Sensor(camera, self.times, self._tell)
+        with self.lock:  # One camera at a time, whoever asks for it.
+            self.sensor.close()
+            self.sensor = Sensor(camera, self.times, self._tell)
 
     def aim(self, name: Text) -> None:
         """Name the object of the next presses; with an empty name they are not recorded."""
@@ -250,7 +251,8 @@ class Studio(Session):
         """Take back the last press, deletion or new name."""
         with self.lock:
             if self.undos:
-                self.undos.pop()()
+                self.undos[-1]()
+                self.undos.pop()  # Only when it is done: what fails may be tried again.
 
     def live(self) -> dict[str, Any]:
         """The sensor as it is now, and what happened."""
@@ -265,16 +267,16 @@ class Studio(Session):
         An object without videos is not shown: there is nothing to rate. Its ratings stay in the folder.
         """
         videos = self.data.recorded()
-        shown = {video.object_id for video in videos} - {"unknown"}
+        shown = {video["object_id"] for video in videos} - {"unknown"}
         rows = [row for row in self.data.ratings() if row["object_id"] in shown]
         own = [row for row in rows if row["rater"] == rater]
         blind = sum(all(row.values()) for row in own) < len(shown)
         return {
             "folder": str(self.data.videos.parent),
-            "videos": [video.model_dump() for video in videos],
+            "videos": videos,
             "properties": [p.model_dump(include={"name", "levels", "phrases"}) for p in self.data.properties],
             "ratings": own if blind else rows,
-            "agreement": None if blind else self.data.agreement(),
+            "agreement": None if blind else self.data.agreement(rows),
             "undo": len(self.undos),
             "model": self.model.folder.name,
             "told": self.told,
@@ -292,7 +294,7 @@ class Studio(Session):
         return {name: [uri(picture, "jpeg") for picture in pictures] for name, pictures in shown.items()}
 
     def _video(self, file: str) -> Path:
-        if file not in {video.file for video in self.data.recorded()}:
+        if file not in {video["file"] for video in self.data.recorded()}:
             raise UserError(f"{file}: no such video; load the page anew")
         return self.data.videos / file
 

@@ -113,6 +113,7 @@ def add_to_list(folder: Path, rows: Sequence[Mapping[str, str]]) -> None:
     elif any(value for row in rows for key, value in row.items() if key not in columns):
         new = {row["file"] for row in rows}
         older = [file for file in _from_names(folder, video_files(folder)[0])[0] if file.relative not in new]
+        older.sort(key=lambda file: (file.object_id, int(file.video_id.rpartition("_")[2])))
         header, before = columns, [{"file": file.relative, "object_id": file.object_id} for file in older]
     else:
         return

@@ -19,7 +19,7 @@ async function act(action, body) {
       shape = "";
     }
     tell("");
-    await refresh();
+    await refresh().catch(error => tell(error.message));
     return answer;
   } catch (error) {
     tell(error.message);
@@ -124,10 +124,12 @@ function slider(object, property) {
     show(input.value);
     const given = {rater: rater(), object_id: object.id, property: property.name, level: Number(input.value)};
     if (await act("rate", given) !== undefined) return;
-    object.own = before;  // It is not written down, so it is not shown, and the next click sends it again.
-    input.value = before[property.name] || 0;
-    input.classList.toggle("unset", !before[property.name]);
-    show(before[property.name]);
+    if (object.own[property.name] !== String(given.level)) return;  // It was moved again meanwhile.
+    const old = before[property.name];  // It is not written down, so it is not shown, and the next click sends it again.
+    object.own = {...object.own, [property.name]: old};
+    input.value = old || 0;
+    input.classList.toggle("unset", !old);
+    show(old);
   };
   input.addEventListener("input", () => show(input.value));
   for (const kind of ["change", "click"]) input.addEventListener(kind, rate);
@@ -194,14 +196,14 @@ function drawSummary() {
   const table = make("table"), missing = lacking(all);
   table.append(...Object.entries(state.agreement).map(([name, icc]) => {
     const line = make("tr"), said = icc ? `${icc[0].toFixed(2)} (${icc[1].toFixed(2)} to ${icc[2].toFixed(2)})`
-      : "needs two raters, and objects that differ";
+      : "needs two raters of the same objects, which differ";
     line.append(make("th", "", spoken(name)), make("td", "", said));
     return line;
   }));
   const list = make("ul");
   list.append(...missing.slice(0, 8).map(words => make("li", "", `no ${words} object yet`)));
   const raters = [...new Set(state.ratings.map(row => row.rater))].join(", ") || "nobody yet";
-  $("summary").replaceChildren(make("p", "note", `Rated by ${raters}. ICC(3,k), with 95 % interval:`), table, list);
+  $("summary").replaceChildren(make("p", "note", `Rated by ${raters}. ICC(3,k) of those who rated most, with 95 % interval:`), table, list);
   const spread = object => state.properties.reduce((sum, p) => {
     const given = object.given.map(row => row[p.name]).filter(Boolean).map(Number);
     return sum + (given.length ? Math.max(...given) - Math.min(...given) : 0);

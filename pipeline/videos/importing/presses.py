@@ -57,14 +57,6 @@ SHORTEST = 3
 """Minimum number of frames of a press; what is shorter is a flicker."""
 
 
-class Recorded(Record):
-    """A row of the `videos.csv` beside videos that were cut from a table's recordings."""
-
-    file: str
-    object_id: str
-    session: str
-
-
 class FrameTime(Record):
     """When a frame of a video was recorded: a row of the CSV beside it."""
 
@@ -141,7 +133,7 @@ def cut(
             pressed = itertools.islice(source, begin - position, end - position)
             write_film(parts[path], (shot.picture for shot in pressed), fps)
             position = end
-        for (path, part), (begin, end) in zip(parts.items(), ranges, strict=True):  # All or none, for who begins anew.
+        for path, (begin, end) in zip(parts, ranges, strict=True):
             rows = [
                 FrameTime(
                     frame=i - begin,
@@ -152,6 +144,7 @@ def cut(
                 for i in range(begin, end)
             ]
             write_csv(path.with_suffix(".csv"), FrameTime, rows)
+        for path, part in parts.items():  # All at the end: who begins anew after an error has none twice.
             os.replace(part, path)
     finally:
         for part in parts.values():
@@ -162,7 +155,7 @@ def cut(
 def cut_into(
     read: Callable[[], Iterator[Shot]], name: str, out: Path, object_id: str, times: float, *, whole: bool = False
 ) -> list[Path]:
-    """As `cut`, into a folder whose list, where it has one, goes on."""
+    """`cut` into a folder whose list, where it has one, goes on."""
     check_extensible(out)
     written = cut(read, name, out, object_id, times, whole=whole)
     add_to_list(out, [{"file": path.name, "object_id": object_id} for path in written])
@@ -190,14 +183,18 @@ def cut_listed(listed: Path, out: Path, fps: float = 0.0) -> list[Path]:
     check_extensible(out)
     sections = [[_seconds(where, column, row.get(column, "")) for column in SECTION] for where, row in rows]
     written, lines = list[Path](), list[Row]()
-    for (where, row), (begin, end) in zip(rows, sections, strict=True):
-        read = partial(film, listed.parent / row["file"], fps, begin or 0.0, end)
-        (path,) = cut(read, where, out, row["object_id"], whole=True)
-        written.append(path)
-        lines.append({**row, "file": path.name})
-        for key in SECTION:
-            lines[-1].pop(key, None)
-    add_to_list(out, lines)
+    try:
+        for (where, row), (begin, end) in zip(rows, sections, strict=True):
+            read = partial(film, listed.parent / row["file"], fps, begin or 0.0, end)
+            written += cut(read, where, out, row["object_id"], whole=True)
+            known = {key: value for key, value in row.items() if key not in SECTION}
+            lines.append(known | {"file": written[-1].name})
+        add_to_list(out, lines)
+    except BaseException:  # The mended table is cut from its beginning.
+        for path in written:
+            path.unlink(missing_ok=True)
+            path.with_suffix(".csv").unlink(missing_ok=True)
+        raise
     return written
 
 
