@@ -17,16 +17,6 @@ from pipeline.running.errors import UserError, did_you_mean
 
 PARAMS_FILE, CHAIN, CONF = Path("params.yaml"), Path("dvc.yaml"), Path("conf")
 PACKAGE = Path(__file__).parents[1]
-OF_PRETRAIN = ("presses", "batch_size", "learning_rate", "weight_decay", "max_grad_norm", "augment")
-FORMER = {
-    "frames.size": "is called frames.pixels now; write that name",
-    "shipped": "is the section `evaluate` now: write evaluate.models=[octopi-small] and evaluate.questions",
-    "cross_validation": "is no section any more; remove it: the folds of split.name=kfold test every object once",
-    "split.test_objects": "was of split.name=development; remove it: split.name=kfold tests every object once",
-    "split.missing": "is no key any more; remove it: the report names validation and test objects without videos",
-    **dict.fromkeys(("scenes.fps", *(f"pretrain.{key}" for key in OF_PRETRAIN)), "has one value now; remove it"),
-}
-"""Parameters of earlier versions, and what took their place."""
 QUOTED = r"""'.*'|".*\""""
 
 
@@ -158,9 +148,7 @@ def validate(values: Mapping[str, Any], origin: str) -> Params:
     except ValidationError as error:
         detail = error.errors(include_url=False)[0]
     key, kind, message = ".".join(map(str, detail["loc"])), detail["type"], detail["msg"].removeprefix("Value error, ")
-    if key in FORMER:
-        line = f"{key} {FORMER[key]}"
-    elif kind == "extra_forbidden":
+    if kind == "extra_forbidden":
         known = list(getattr(kind_of(detail["loc"][:-1]), "model_fields", ()))
         hint = did_you_mean(str(detail["loc"][-1]), known)
         line = f"{key} is not a parameter; {hint}allowed here: {', '.join(known)}"

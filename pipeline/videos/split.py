@@ -47,9 +47,9 @@ def assign_objects(
     """
     name, allowed = config.name, [*catalogue.split_names, "kfold"]
     if name not in allowed:
-        # Of earlier versions.
-        why = "is split.name=kfold now" if name == "development" else "is no split of the catalogue"
-        raise UserError(f"split.name={name} {why}; allowed: {', '.join(allowed)} (see objects.csv)")
+        raise UserError(
+            f"split.name={name} is no split of the catalogue; allowed: {', '.join(allowed)} (see objects.csv)"
+        )
     fold = config.fold_of(seed)
     if fold is not None:
         parts = _deal(catalogue, present, config, fold)
