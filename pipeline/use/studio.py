@@ -105,6 +105,10 @@ class Sensor:
                 self.near = -2 * LONGEST  # The reference holds this touch until then, and shows its negative.
             self.near, self.held, self.strongest = self.near + 1 if over or self.near < 0 else 0, 0, None
             self.quiet.append(seen)
+            thumbs = [one.thumb for one in self.quiet][-LONGEST:]
+            known = self.gel and self.gel[0].shape == thumbs[0].shape  # Else it is the first one, or in another format.
+            if not known and len(thumbs) == LONGEST and is_steady(thumbs):
+                self.gel = [mean(thumbs)]
         else:
             self.near, self.held = 0, self.held + over
             self.strongest = max(self.strongest or seen, seen, key=lambda one: one.strength)
@@ -140,11 +144,10 @@ class Sensor:
             found[f"it dropped {missing} of the last {count + missing} pictures"] = missing > LOST
         if len(quiet) == LONGEST and not is_steady([seen.thumb for seen in quiet]):
             found["the light still changes; wait"] = True
-        elif len(quiet) == LONGEST:
-            now = mean([seen.thumb for seen in quiet])
-            self.gel = [gel for gel in self.gel if gel.shape == now.shape] or [now]
-            light = float(now[:, :, 0].mean()) - float(self.gel[0][:, :, 0].mean())
-            drift = contact_strength(now, self.gel[0]) > quiet[-1].threshold
+        elif len(quiet) == LONGEST and self.gel and self.gel[0].shape == quiet[0].thumb.shape:
+            now, gel = mean([seen.thumb for seen in quiet]), self.gel[0]
+            light = float(now[:, :, 0].mean()) - float(gel[:, :, 0].mean())
+            drift = contact_strength(now, gel) > quiet[-1].threshold
             found[f"the light has changed by {light:+.0f} of 255 since the start"] = abs(light) > STEP
             found["the untouched gel is not as at the start: is something on it, has it moved?"] = drift
         return [words for words, odd in found.items() if odd]
