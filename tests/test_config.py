@@ -14,6 +14,7 @@ from pipeline.encoder.recipes import RECIPES
 from pipeline.language.start import objects_met
 from pipeline.running.errors import UserError, without_secrets
 from pipeline.scales import check_inputs, compose, prune, scale_names, write_params
+from pipeline.scales.memory import read_shapes
 from pipeline.videos.split import assign_objects
 from tests.conftest import CATALOGUE, ROOT, refused
 
@@ -113,7 +114,7 @@ LOGITS = "smoke encoder={embedding:logits,standardize:true} questions.two_turns=
         ("small data.source=videos data.dir=nowhere", "data.dir: nowhere does not exist"),
         ("smoke language.weights=nowhere", "hf download lmsys"),
         ("smoke language.start=models/nothing", "language.start: models/nothing holds no trained model"),
-        ("smoke scenes.objects=[unicorn]", "scenes.objects: unicorn"),
+        ("smoke scenes.objects=[unicorn] split.name=kfold", "scenes.objects: unicorn"),
         (f"smoke scenes.objects=[{TRAINED},bath_towel]", "ablation.touch: swapped .* only bath_towel"),
         (f"smoke scenes.objects=[{TRAINED},bath_towel] ablation.touch=[removed]", ""),
         (f"smoke scenes.objects=[{TRAINED},bath_towel,ice_block]", ""),
@@ -129,7 +130,9 @@ def test_what_cannot_run_is_one_line_with_key_and_mend(
     monkeypatch.chdir(ROOT)
     name, *overrides = arguments.split()
     with refused(words) if words else nullcontext():
-        check_inputs(compose(name, overrides))
+        params = compose(name, overrides)
+        read_shapes(params)
+        check_inputs(params)
 
 
 @pytest.mark.parametrize("listed", [True, False])

@@ -51,9 +51,6 @@ def check_inputs(params: Params) -> str:
             f"data.dir: {folder} does not exist; import the public data set (README, Real videos, real weights) or "
             "name the folder with data.dir=..."
         )
-    unknown = [o for o in params.scenes.objects if o not in catalogue.objects]
-    if unknown:
-        raise UserError(f"scenes.objects: {unknown[0]} is not in {params.data.catalogue}/objects.csv")
     lacking = check_objects(params, catalogue)
     encoder, language = Path(params.encoder.weights), Path(params.language.weights)
     check_encoder(encoder, params.frames.pixels, params.encoder.backbone)

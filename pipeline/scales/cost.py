@@ -28,10 +28,12 @@ DRIVERS = {"12": 525, "13": 580}
 """The oldest NVIDIA driver for Linux, by CUDA's major version (release notes of the CUDA toolkit)."""
 HOURS = {
     "smoke": "0.1 on two cores",
+    "small": "24 on two cores (estimated)",
+    "invented": "24 on two cores (estimated)",
     "finetune": "0.2 of each language model on two cores",
     "rehearsal": "0.4 on two cores (docs/scale.md)",
 }
-"""By scale, as its own settings were measured."""
+"""By scale, with its own settings; measured, where nothing else is said."""
 PAPER = {"paper-7b": (6, 5, "its RTX A6000"), "paper-13b": (6, 6.5, "its two RTX A6000")}
 """Hours of the encoder and of a language model's training, on what, by the paper (Yu et al. 2024, section V-C)."""
 
@@ -46,11 +48,13 @@ def costs(params: Params, shapes: Shapes) -> Iterator[str]:
     for folder, llm in ((Path(params.encoder.weights), None), (Path(params.language.weights), shapes.llm)):
         found = next((d for d in DOWNLOADED.values() if d.folder == folder.name), None)
         if found and not folder.is_dir():
-            size, twice = (CLIP, ", its text tower included") if llm is None else (parameters(llm) * 2, ", as pickles")
             # Pickles are converted into a second folder, and may be removed then.
-            fetched += size if llm is None else 2 * size
-            gigabytes = f"{_round(size / GB)} GB{twice}"
-            yield f"Download: {found.repository}, {gigabytes}, to {folder} (README, Real videos, real weights)."
+            vicuna = (2 * parameters(llm) if llm else 0, 2, " as pickles")
+            known = {"vicuna": vicuna, "clip": (CLIP, 1, " with its text tower")}
+            size, times, what = known.get(folder.name.partition("-")[0], (0, 0, ""))
+            fetched += size * times
+            much = f", {_round(size / GB)} GB{what}" if size else ""
+            yield f"Download: {found.repository}{much}, to {folder} (`octopi weights` checks it)."
     if params.data.source == "videos" and not place.is_dir():
         yield f"Videos: {params.data.dir} is not there (README, Real videos, real weights)."
     for seed in params.ablation.seeds if objects else ():
