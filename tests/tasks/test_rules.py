@@ -178,7 +178,6 @@ def test_gold_answers_are_strictly_right_and_so_is_what_follows_them() -> None:
             assert all(s.strict for s in graded(question, text).values())
             assert all(s.strict for s in graded(question, f"{text} And so on.").values())
             assert not any(s.strict for s in graded(question, text.upper()).values())
-            assert all(s.correct for s in graded(question, text.upper()).values()), "reading is tolerant"
 
     # What was graded by hand has no strict score.
     for question in EACH_TASK["PSR"] + EACH_TASK["RIPE"]:
