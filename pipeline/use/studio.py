@@ -75,6 +75,7 @@ class Sensor:
             try:
                 for press in presses(self._shots(), self.times, self._see):
                     self.tell(self._doubts(), press)
+                    self.held, self.strongest = 0, None  # As behind what is no press.
                 self.gone = f"{self.camera}: has ended"
             except Exception as error:  # Also what OpenCV raises where a stream changes its size: it is opened again.
                 self.gone = str(error)
@@ -112,10 +113,13 @@ class Sensor:
         else:
             self.near, self.held = 0, self.held + over
             self.strongest = max(self.strongest or seen, seen, key=lambda one: one.strength)
-        if seen.state == "short":
-            self.tell("too short, nothing is recorded: press again", [])
-        elif seen.state == "light":
-            self.tell("a change of the light, or half a minute without a release: nothing is recorded", [])
+        ended = {
+            "short": "too short, nothing is recorded: press again",
+            "light": "a change of the light, or half a minute without a release: nothing is recorded",
+        }
+        if seen.state in ended:
+            self.tell(ended[seen.state], [])
+            self.held, self.strongest = 0, None  # The next touch may follow at once.
         self.curve.append(seen.strength / seen.threshold)
         self.last = seen
 
