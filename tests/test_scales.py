@@ -148,6 +148,11 @@ def test_the_papers_scales_fit_the_cards_they_name() -> None:
     assert "Hours: 26, " in said["paper-7b"], "one encoder of 6 and four language models of 5"
     seven = compose("paper-7b")
     assert "Card: 40 GB" in card(seven, [*count(seven, read_shapes(seven))])
+    smaller = compose("paper-7b", ["runtime.gradient_checkpointing=true"])
+    assert "Card: 24 GB" in card(smaller, [*count(smaller, read_shapes(smaller))]), "as docs/scale.md says"
+    assert "clip_224.openai, 1.7 GB with its text tower, to" in said["paper-7b"]
+    sparsh = compose("small", ["encoder.weights=weights/sparsh-dino-base"])
+    assert "facebook/sparsh-dino-base, to weights" in "\n".join(costs(sparsh, read_shapes(sparsh))), "of unknown size"
     # 13.016e9 weights of 2 bytes, by transformers' own count of this configuration.
     words = "each of 2 processes loads the whole language model (26 GB) before it keeps its share, 52.1 GB"
     assert words in said["paper-13b"]

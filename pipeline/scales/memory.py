@@ -78,7 +78,7 @@ def read_shapes(params: Params) -> Shapes:
     """Read the base models' shapes, and look for the longest conversation; UserError for an unknown scenes.objects."""
     catalogue, config = catalogue_of(params), params.encoder
     if unknown := [o for o in params.scenes.objects if o not in catalogue.objects]:
-        raise UserError(f"scenes.objects: {unknown[0]} is not in {params.data.catalogue}/objects.csv")
+        raise UserError(f"scenes.objects: {unknown[0]} is not in {params.data.catalogue}/objects.csv; [] takes all")
     encoder, language = Path(config.weights), Path(params.language.weights)
     tower, llm = read_tower(encoder), read_language(language)
     notes = ["language.dtype is auto: counted as float32."] if params.language.dtype == "auto" else []

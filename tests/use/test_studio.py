@@ -43,7 +43,7 @@ def test_what_is_odd_about_camera_gel_and_press_is_said(monkeypatch: pytest.Monk
 
     def plugged(name: object) -> Camera:
         light = [np.clip(picture.astype(int) + 20, 0, 255).astype(np.uint8) for picture in pictures[:25]]
-        twice = [*pictures[:53], *pictures[35:40], *pictures[50:80]]  # No untouched picture is between these presses.
+        twice = [*pictures[:53], *pictures[35:40], *pictures[50:80]]  # The second begins as the first ends.
         films = [*twice, *weak, *pictures[:15], *pictures[80:]], 3 * light, [p[:-16].copy() for p in 3 * light]
         opened.append(Slow(films[2 if seen else bool(opened)], name))
         return opened[-1]
