@@ -16,7 +16,7 @@ if __name__ == "__main__":
         config = run.params.questions
         catalogue = load_catalogue(Path(run.params.data.catalogue)).asking(config.scenarios, config.wording)
         catalogue = catalogue.called(config.names)
-        training = {name: getattr(config, name) for name in ("inexact", "two_turns", "plainly")}
+        training = {name: getattr(config, name) for name in ("two_turns", "plainly")}
         for seed in run.params.ablation.seeds:
             assignments = read_table(split_file(seed), Assignment)
             for name, part, counts, distinct in (

@@ -93,7 +93,6 @@ def test_any_folder_may_hold_the_videos(name: str, tmp_path: Path) -> None:
 
 
 TRAINED = "baseball,pillow,rug,potato,millet"
-LOGITS = "smoke encoder={embedding:logits,standardize:true} questions.two_turns=0.5 lora.skip_contradicted=true"
 
 
 # Further ones take the whole way in tests/chain/test_bad_inputs.py.
@@ -105,7 +104,6 @@ LOGITS = "smoke encoder={embedding:logits,standardize:true} questions.two_turns=
         ("smoke split.fold=1", "split.fold is not a parameter.*folds"),
         ("smoke split.name=kfold split.folds=3 ablation.seeds=[0,1,3]", r"ablation.seeds \[0, 1, 3\].*3 folds"),
         ("smoke ablation.opd=[none]", "ablation.opd.*lacks the full system's value all"),
-        (LOGITS, "lora.skip_contradicted.*questions.two_turns=0"),
         ("smoke encoder.epochs=true", "encoder.epochs is True: .*valid integer"),
         ("smoke encoder.backbone=[timm] encoder.recipe=paper", "encoder.recipe=paper is for CLIP alone"),
         ("smoke frames.pixels=48", "frames.pixels"),

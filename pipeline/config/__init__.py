@@ -153,9 +153,6 @@ class QuestionsConfig(Section):
     them: then no knowledge of the world is asked for. Tables say so."""
     names: Literal["catalogue", "number"] = "catalogue"
     """What objects are called. `number`: "object 7", as in the training of the shipped model, which copies no other."""
-    inexact: Annotated[Number, Field(ge=0, le=1)] = 0.0
-    """`facts` in training: probability that a stated class is a neighbour of the right one; the right matching stays
-    the nearest. An encoder errs so, and from exact facts the model would learn to look for equal classes alone."""
     restate: bool = False
     """Where everything is described (OPD `all`), answers to PC and PSS name the classes of the property asked for, and
     which object has more or less of it, before they conclude: for a model too small to find and compare at once."""
@@ -332,11 +329,6 @@ class LoraTrainConfig(TrainConfig):
     target_modules: Literal["all-linear"] | Annotated[tuple[str, ...], Field(min_length=1)] = ("q_proj", "k_proj")
     """Linear layers that get an adapter (the paper does not say; the published code: q_proj and k_proj); `all-linear`:
     all but the one that gives the logits."""
-    given: Annotated[Number, Field(ge=0, le=1)] = 0.0
-    """Share of the questions about several videos that get another question's videos, with their descriptions left out
-    of the loss: the model must then conclude from the description and not from touch."""
-    skip_contradicted: bool = False
-    """Leave out comparisons whose right answer contradicts the property heads (with `encoder.embedding=logits`)."""
 
 
 class AblationConfig(Section):
@@ -476,10 +468,6 @@ class Params(Section):
                 f"ablation.seeds {list(self.ablation.seeds)} test on some of the {self.split.folds} folds more often "
                 "than on others; take as many seeds for each fold"
             )
-        if self.lora.skip_contradicted and self.encoder.embedding != "logits":
-            raise ValueError("lora.skip_contradicted reads the heads' logits; set encoder.embedding=logits")
-        if self.lora.skip_contradicted and self.questions.two_turns:
-            raise ValueError("lora.skip_contradicted looks at one conclusion a question; set questions.two_turns=0")
         return self
 
     @property

@@ -156,18 +156,6 @@ def encode(rendered: Rendered, tokenizer: PreTrainedTokenizerBase, *, bos: bool 
     return Encoded(tuple(token for token, *_ in found), tuple(labels))
 
 
-def conclusions(rendered: Rendered, turns: Sequence[Turn]) -> Rendered:
-    """The conversation with only conclusions, each with its end token, marked as answers; descriptions are not."""
-    spans = []
-    for (start, stop), turn in zip(rendered.answers, turns, strict=True):
-        if turn.described:
-            # The space before a word belongs to its token.
-            start = rendered.text.index(turn.assistant, start) + turn.described
-        if turn.described < len(turn.assistant):
-            spans.append((start, stop))
-    return Rendered(rendered.text, tuple(spans))
-
-
 def _published(turns: Sequence[Turn], end: str, system: str, frames: int, complete: bool, single: bool) -> Rendered:
     """A conversation as the published code writes it, with `PIECE` before each piece.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import torch
 from torch.nn import functional as F
@@ -14,7 +14,7 @@ from transformers import PreTrainedTokenizerBase
 from pipeline.config import LanguageConfig
 from pipeline.core.records import Opd, Question
 from pipeline.core.runtime import derive_seed
-from pipeline.language.chat import IGNORE_INDEX, conclusions, encode, render
+from pipeline.language.chat import IGNORE_INDEX, encode, render
 from pipeline.running.errors import UserError
 from pipeline.training.embeddings import FLIPS, EmbeddingStore
 from pipeline.training.sampling import EpochDataset, sample_evaluation, sample_training
@@ -32,7 +32,6 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
     Args:
         positions: Tokens that the language model can read at once; None where that is unknown. A question that is
             longer is a UserError.
-        given: Ids of questions whose descriptions are given: nothing of them is learnt.
         by_question: Divide the weights of a conversation by their sum, so that all conversations weigh alike.
     """
 
@@ -48,7 +47,6 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         flip_probability: float,
         seed: int,
         positions: int | None,
-        given: Collection[str] = (),
         by_question: bool,
     ) -> None:
         super().__init__()
@@ -65,14 +63,10 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
             )
             encoded = encode(rendered, tokenizer, bos=language.bos)
             check_length(question.question_id, len(encoded.input_ids), positions)
-            learnt = encoded.labels
-            if question.question_id in given:
-                learnt = encode(conclusions(rendered, dialogue.turns), tokenizer, bos=language.bos).labels
-            # Given descriptions keep their labels; their weight of 0 leaves them out of the loss.
-            weights = (torch.tensor(learnt) != IGNORE_INDEX).float()
+            ids, labels = torch.tensor(encoded.input_ids), torch.tensor(encoded.labels)
+            weights = (labels != IGNORE_INDEX).float()
             if by_question:
                 weights = F.normalize(weights, p=1.0, dim=0)
-            ids, labels = torch.tensor(encoded.input_ids), torch.tensor(encoded.labels)
             self.written.append({"input_ids": ids, "labels": labels, "weights": weights})
 
     @property

@@ -18,7 +18,6 @@ from pipeline.core.layout import embeddings_dir, questions_file
 from pipeline.core.records import Encoder, Opd, Question
 from pipeline.core.runtime import derive_seed, name_dtype, seed_everything
 from pipeline.language.base import ADAPTER_WEIGHTS
-from pipeline.language.classes import uncontradicted
 from pipeline.language.conversations import ConversationDataset, UpdateSampler, collate
 from pipeline.language.octopi import ADAPTER_DIR, CONFIG_FILE, OctopiForCausalLM, read_config
 from pipeline.running.errors import UserError
@@ -107,18 +106,13 @@ def assemble(
     else:
         model = OctopiForCausalLM.from_pretrained(aligned, base=language.weights, **how)
     usable = [q for q in material.questions if q.dialogue(material.opd)]
-    if isinstance(config, LoraTrainConfig) and config.skip_contradicted:
-        usable = uncontradicted(usable, material.store, material.catalogue)
     random.Random(derive_seed(material.seed, purpose)).shuffle(usable)
     if not usable:
         raise UserError(f"no training question has OPD mode {material.opd}; raise questions.train in params.yaml")
     if len(usable) < config.samples:
         logger.warning("%s: only %d training questions for %d samples", purpose, len(usable), config.samples)
-    drawn, given = usable[: config.samples], set[str]()
-    if isinstance(config, LoraTrainConfig) and config.given:
-        drawn, given = with_given(drawn, material.opd, config.given, material.seed)
     data = ConversationDataset(
-        drawn,
+        usable[: config.samples],
         material.opd,
         material.store,
         model.tokenizer,
@@ -128,25 +122,8 @@ def assemble(
         seed=material.seed,
         positions=model.positions,
         by_question=config.weighting == "question",
-        given=given,
     )
     return model, data
-
-
-def with_given(questions: Sequence[Question], opd: Opd, share: float, seed: int) -> tuple[list[Question], set[str]]:
-    """All questions in their order, and the ids of the share with descriptions whose videos were exchanged.
-
-    They are exchanged among questions with equally many videos. Their descriptions no longer fit, and are left out of
-    the loss. So the model learns to conclude from the description in the text, and not directly from touch.
-    """
-    rng = random.Random(derive_seed(seed, "given"))
-    changed: dict[str, Question] = {}
-    for count in (2, 3):
-        told = [q for q in questions if len(q.videos) == count and (d := q.dialogue(opd)) and d.turns[0].described]
-        chosen = rng.sample(told, round(share * len(told)))
-        for own, other in zip(chosen, chosen[1:] + chosen[:1], strict=True):
-            changed[own.question_id] = own.model_copy(update={"videos": other.videos})
-    return [changed.get(q.question_id, q) for q in questions], set(changed)
 
 
 @dataclass(frozen=True)

@@ -105,7 +105,6 @@ def beyond_paper(params: Params, conf: Path) -> dict[str, Any]:
     """The settings that have an effect and are not those of `paper-7b` in the folder `conf`, by their keys."""
     encoder, start = params.encoder, params.language.start
     void = UNTOLD | ({"begin_with_words", "normalize_touch"} if start else set())
-    void |= set() if params.questions.facts else {"inexact"}
     void |= {"wording"} if params.questions.wording == "texts" else set()  # Whole texts are how the paper describes.
     read = {"scenes": ["pretrain"], "timm": ["feature_stage"], "clip": ["prompts", "prompt_layers", "embedding"]}
     void |= {key for name, keys in read.items() if name not in encoder.backbone for key in keys}

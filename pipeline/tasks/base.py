@@ -126,11 +126,8 @@ class TaskDefinition(ABC):
         """Accuracy of a uniform guess, 0 to 1, by measure."""
         return {"choice": 1 / self.choices}
 
-    def with_facts(self, draft: Draft, catalogue: Catalogue, rng: random.Random, inexact: float = 0.0) -> Draft:
-        """The question with a fact about each object that it names; unchanged if it names none.
-
-        Each class in a fact is replaced by a neighbouring one with probability `inexact`.
-        """
+    def with_facts(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
+        """The question with a fact about each object that it names; unchanged if it names none."""
         return draft
 
     def plainly(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:

@@ -17,13 +17,11 @@ from pipeline.videos.catalogue.wording import unmarked
 OPENINGS = ("Given three tactile videos: {videos}.", "You have tactile videos of one object each: {videos}.")
 REQUEST = "atch each video to one of the following objects in alphabetical order: {options}."
 ORDERS = tuple("".join(order) for order in itertools.permutations("123"))
-FACT_DRAWS = 60
-"""Attempts to draw inexact facts; after these, facts are stated exactly."""
 
 
-def fact(catalogue: Catalogue, object_id: str, labels: Sequence[int] | None = None) -> str:
-    """What an object is like, by `labels` or else its own classes: "hard, smooth, no bumps is a ruler."."""
-    classes = zip(catalogue.properties, labels or catalogue.labels(object_id), strict=True)
+def fact(catalogue: Catalogue, object_id: str) -> str:
+    """What an object is like, by its classes: "hard, smooth, no bumps is a ruler."."""
+    classes = zip(catalogue.properties, catalogue.labels(object_id), strict=True)
     return sentence([p.levels[level] for p, level in classes], catalogue.objects[object_id].name)
 
 
@@ -32,30 +30,9 @@ def sentence(classes: Iterable[str], name: str) -> str:
     return f"{', '.join(classes)} is {name}."
 
 
-def facts(catalogue: Catalogue, objects: Sequence[str], rng: random.Random, inexact: float = 0.0) -> str:
-    """What each object is like, in random order.
-
-    Each class is replaced by a neighbouring one with probability `inexact`; the right matching still fits best.
-    """
-    right = [catalogue.labels(o) for o in objects]
-    told = right
-    for _ in range(FACT_DRAWS if inexact else 0):
-        told = [
-            tuple(
-                rng.choice([n for n in (level - 1, level + 1) if 0 <= n < len(p.levels)] or [level])
-                if rng.random() < inexact
-                else level
-                for p, level in zip(catalogue.properties, labels, strict=True)
-            )
-            for labels in right
-        ]
-        others = (steps(told, order) for order in itertools.permutations(right) if list(order) != right)
-        # Otherwise another matching would fit the facts as well as the right one.
-        if steps(told, right) < min(others):
-            break
-        told = right
-    sentences = [fact(catalogue, o, labels) for o, labels in zip(objects, told, strict=True)]
-    return " ".join(rng.sample(sentences, len(sentences)))
+def facts(catalogue: Catalogue, objects: Sequence[str], rng: random.Random) -> str:
+    """What each object is like, in random order."""
+    return " ".join(rng.sample([fact(catalogue, o) for o in objects], len(objects)))
 
 
 def steps(some: Iterable[Sequence[float]], others: Iterable[Sequence[float]]) -> float:
@@ -133,10 +110,10 @@ class PropertyObjectMatching(TaskDefinition):
         turns = base.single_turn(user, base.concluded(catalogue, objects, in_words(catalogue, objects)))
         return base.draft_about(pool, objects, rng, turns=turns, choice=order, properties=catalogue.property_names)
 
-    def with_facts(self, draft: Draft, catalogue: Catalogue, rng: random.Random, inexact: float = 0.0) -> Draft:
+    def with_facts(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
         """The question after facts about its objects, so that it tests touch and reasoning, not knowledge of
         objects."""
-        told, dialogues = facts(catalogue, draft.objects, rng, inexact), []
+        told, dialogues = facts(catalogue, draft.objects, rng), []
         for dialogue in draft.dialogues:
             first, *rest = dialogue.turns
             first = first.model_copy(update={"user": f"{told} {first.user}"})

@@ -57,7 +57,6 @@ def build_questions(
     seed: int,
     distinct: bool,
     facts: bool = False,
-    inexact: float = 0.0,
     restate: bool = False,
     two_turns: float = 0.0,
     plainly: float = 0.0,
@@ -70,7 +69,6 @@ def build_questions(
 
     Args:
         facts: Whether questions first state what the objects that they name are like (`TaskDefinition.with_facts`).
-        inexact: Probability that a class in such a fact is off by one.
         restate: Whether answers repeat the classes asked for before they conclude (`TaskDefinition.restated`).
         two_turns: Share of the questions about several videos that become a dialogue: descriptions first, then a turn
             for each of the task's questions about these videos (`in_turns`).
@@ -100,7 +98,7 @@ def build_questions(
                 more += islice(filter(None, choices), CHOICES)
                 draft = in_turns(draft, turns.sample(more, len(more)), told.catalogue)
             if facts:
-                draft = definition.with_facts(draft, told.catalogue, order, inexact)
+                draft = definition.with_facts(draft, told.catalogue, order)
             questions.append(draft.numbered(f"{task}-{place}-{number:05d}", task, pool.part))
     random.Random(derive_seed(seed, pool.part, "order")).shuffle(questions)
     return questions

@@ -66,28 +66,6 @@ def test_updates_are_equal_on_any_device(lengths: list[int], micro: int, rounds:
         assert all(low[1] <= high[0] for low, high in pairwise(ranges))
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
-def test_given_descriptions_are_not_learnt_and_stand_beside_other_touches(share: float, held: Material) -> None:
-    _, usual = assemble(held, taking(1000), "test")
-    model, data = assemble(held, taking(1000, given=share), "test")
-    several, changed = 0, 0
-    for index, (own, question) in enumerate(zip(usual.questions, data.questions, strict=True)):
-        assert question == own.model_copy(update={"videos": question.videos}), "asked and answered as before"
-        learnt = data[index]["weights"] > 0
-        several += len(own.videos) > 1
-        if question.videos == own.videos:
-            assert torch.equal(learnt, usual[index]["weights"] > 0)
-            continue
-        changed += 1
-        assert question.videos in {q.videos for q in usual.questions if len(q.videos) == len(own.videos) > 1}
-        # The words that are learnt, without the tokens that end a turn.
-        text = model.tokenizer.decode(data.written[index]["input_ids"][learnt], skip_special_tokens=True)
-        turns = question.dialogue(held.opd).turns
-        assert text.split() == " ".join(t.assistant[t.described :] for t in turns).split()
-    assert several
-    assert changed == pytest.approx(share * several, abs=1)
-
-
 def felt(labels: tuple[int, ...], drawn: torch.Generator) -> torch.Tensor:
     """An embedding that tells all classes, and noise."""
     values = torch.tensor(labels, dtype=torch.float32) - 1

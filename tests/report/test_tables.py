@@ -270,13 +270,13 @@ def test_every_setting_that_is_not_papers_is_counted_and_named_in_the_fold() -> 
     def beyond(scale: str, *overrides: str) -> dict[str, Any]:
         return beyond_paper(compose(scale, overrides, ROOT / "conf"), ROOT / "conf")
 
-    idle = ("encoder.feature_stage=1", "pretrain.steps=1", "questions.inexact=0.5", "questions.wording=texts", "seed=1")
+    idle = ("encoder.feature_stage=1", "pretrain.steps=1", "questions.wording=texts", "seed=1")
     assert beyond("paper-13b", *idle) == {}, "and batches are computed in other parts"
     assert beyond("paper-7b", "lora.rank=3", "frames.fraction=0.9") == {"frames.fraction": 0.9, "lora.rank": 3}
-    found = beyond("small", "lora.given=0.7", "pretrain.steps=1")
-    assert (found["lora.given"], found["pretrain.steps"], found["align.begin_with_words"]) == (0.7, 1, True)
+    found = beyond("small", "questions.plainly=0.7", "pretrain.steps=1")
+    assert (found["questions.plainly"], found["pretrain.steps"], found["align.begin_with_words"]) == (0.7, 1, True)
     assert "encoder.embedding" not in found, "CLIP's alone"
-    # The start has its connector, and without facts none is inexact; a place of this machine is not told.
-    begun = beyond("finetune", "questions.facts=false", "language.start=/home/me/model")
-    assert (begun["language.start"], begun["lora.skip_contradicted"]) == ("model", True)
-    assert not {"align.begin_with_words", "language.normalize_touch", "questions.inexact"} & {*begun}
+    # The start has its connector; a place of this machine is not told.
+    begun = beyond("finetune", "language.start=/home/me/model")
+    assert (begun["language.start"], begun["lora.samples"]) == ("model", 480)
+    assert not {"align.begin_with_words", "language.normalize_touch"} & {*begun}
