@@ -159,7 +159,7 @@ def test_old_touches_are_forgotten(tmp_path: Path, catalogue: Catalogue) -> None
 
 
 @pytest.mark.slow
-def test_in_a_browser(site: str, tmp_path: Path) -> None:
+def test_in_a_browser(site: str, session: Session, tmp_path: Path) -> None:
     files = [press(tmp_path / "soft <i>thing.mp4"), press(tmp_path / "other.mp4", begin=12)]
     (notes := tmp_path / "notes.txt").write_text("no video")
     with tab(tmp_path) as page:
@@ -192,6 +192,19 @@ def test_in_a_browser(site: str, tmp_path: Path) -> None:
         page.type("#question", "{tactile} {tactile} {tactile}?")
         page.until("document.querySelector('#message').textContent.includes('3 {tactile} for 2 videos')")
         assert page.run("document.querySelectorAll('.said').length") == 4, "what was refused is no part of the talk"
+        model: Any = session.model
+        model.gate = threading.Event()
+        page.run("document.querySelector('#question').value = ''")
+        page.type("#question", "late?")
+        page.until("[...document.querySelectorAll('.model')].at(-1).textContent === 'late? '")
+        page.run("document.querySelector('#reset').click()")
+        model.gate.set()
+        page.until("!document.querySelector('#send').disabled")
+        page.type("#question", "Why?")
+        page.until("document.querySelector('.model') && !document.querySelector('#send').disabled")
+        shown = page.run("[...document.querySelectorAll('.model')].map(e => e.textContent)")
+        assert shown == [f"{{tactile}} {{tactile}} Why? | {digest(files[0])} | {digest(files[1])} "], "it begins anew"
+        model.gate = None
         page.run("document.querySelector('#scene').value = 'baseball'")
         page.run("document.querySelector('#scene').dispatchEvent(new Event('change'))")
         page.until("document.querySelectorAll('.touch').length === 3")

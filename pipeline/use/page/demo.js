@@ -5,6 +5,7 @@ const MOST = 3;
 let touches = [];  // shown on the page
 let fresh = [];    // ids of those that no question was about yet
 let turns = [];    // of the conversation: {question, touches, answer}
+let talk = new AbortController();  // a new conversation breaks off the answer of the one before
 
 // The studio's address ends with a token; the demo has none.
 function call(address, options = {}) {
@@ -124,10 +125,10 @@ async function ask(event) {
   const about = (fresh.length === places ? fresh : touches.map(t => t.id)).slice(0, Math.max(places, fresh.length));
   $("send").disabled = true;
   tell("");
-  const asked = say("person", question), said = say("model", "...");
+  const {signal} = talk, asked = say("person", question), said = say("model", "...");
   try {
     const response = await call("api/ask", {
-      method: "POST", headers: {"Content-Type": "application/json"},
+      method: "POST", headers: {"Content-Type": "application/json"}, signal,
       body: JSON.stringify({question, touches: about, history: turns}),
     });
     if (!response.ok) throw new Error(await failed(response));
@@ -137,6 +138,7 @@ async function ask(event) {
       answer += piece.value;
       said.textContent = answer.split("\x1e")[0];
     }
+    signal.throwIfAborted();
     const [spoken, heads] = answer.split("\x1e");
     if (heads) said.after(make("p", "note heads", heads));
     turns.push({question, touches: about, answer: spoken});
@@ -145,7 +147,8 @@ async function ask(event) {
   } catch (error) {
     asked.remove();
     said.remove();
-    tell(error.message);
+    if (signal.aborted) $("question").value = "";
+    else tell(error.message);
   }
   $("send").disabled = false;
 }
@@ -176,6 +179,8 @@ $("question").addEventListener("keydown", event => {
   if (event.key === "Enter" && !event.shiftKey) ask(event);
 });
 $("reset").addEventListener("click", () => {
+  talk.abort();
+  talk = new AbortController();
   turns = [];
   fresh = touches.map(t => t.id);
   $("chat").replaceChildren();
