@@ -42,6 +42,9 @@ WIDTH, SHOWN = 480, FramesConfig(pixels=160, per_video=6, selection="contact")
 """Width of the live picture, and what raters are shown of a video."""
 WEAK, BRIEF = 1.5, 8
 """A press is weak up to so many times the strength that it begins at, and short under so many pictures."""
+DIRT, UNEVEN = 1.0, 0.1
+"""A part of the picture is dirty where it moves the mean change from the median one by so many 8-bit steps, and by this
+share of the median: a change of the light is uneven, too."""
 RECENT, LOST = 150, 3
 """Pictures that rate and drops are measured on, and how many of them may be missing without a word."""
 AGAIN = 2.0
@@ -150,8 +153,11 @@ class Sensor:
             found["the light still changes; wait"] = True
         elif len(quiet) == LONGEST and self.gel and self.gel[0].shape == quiet[0].thumb.shape:
             now, gel = mean([seen.thumb for seen in quiet]), self.gel[0]
-            light = float(now[:, :, 0].mean()) - float(gel[:, :, 0].mean())
-            drift = contact_strength(now, gel) > quiet[-1].threshold
+            change = now[:, :, 0] - gel[:, :, 0].astype(float)
+            light = float(np.median(change))  # As most of the picture has it.
+            # Dirt is darker everywhere, or brighter, which contact strength takes for a change of the light.
+            dirt = abs(float(change.mean()) - light) > max(DIRT, UNEVEN * abs(light))
+            drift = dirt or contact_strength(now, gel) > quiet[-1].threshold
             found[f"the light has changed by {light:+.0f} of 255 since the start"] = abs(light) > STEP
             found["the untouched gel is not as at the start: is something on it, has it moved?"] = drift
         return [words for words, odd in found.items() if odd]

@@ -17,10 +17,10 @@ from pipeline.videos.film import write_film
 from pipeline.videos.frames.reference import LONGEST
 from pipeline.videos.importing.presses import Shot
 from tests.checkpoints import model_folder
-from tests.conftest import wait_for
+from tests.conftest import HUNG, wait_for
 from tests.use.browser import Tab, tab
 from tests.use.fake import Running
-from tests.use.test_live import Camera
+from tests.use.test_live import Camera, shots
 from tests.use.videos import recording
 
 pytestmark = pytest.mark.slow
@@ -66,6 +66,37 @@ def test_what_is_odd_about_camera_gel_and_press_is_said(monkeypatch: pytest.Monk
     touches = [("", True), ("short", True), ("too weak", False), ("too short", False)]
     assert found == [*touches, ("cut off before the release", True)]
     assert len({shot.stamped for shot in told[0][1]}) == len(told[0][1]), "each picture has its time"
+
+
+def watched(
+    pictures: Sequence[np.ndarray], monkeypatch: pytest.MonkeyPatch, lost: range = range(0)
+) -> tuple[list[str], list[str]]:
+    """What a sensor notes in the end, whose camera sends pictures and loses some; and what it told of touches."""
+    told, sent = list[str](), shots(pictures, [i for i in range(len(pictures)) if i not in lost])
+    monkeypatch.setattr(studio, "watch", lambda *_: iter(sent))
+    monkeypatch.setattr(studio, "AGAIN", HUNG)
+    sensor = Sensor("0", 2.0, lambda odd, _: told.append(odd))
+    wait_for(lambda: sensor.gone.endswith("has ended"))
+    sensor.close()
+    return sensor.notes(), told
+
+
+def test_dirt_that_is_darker_than_the_gel_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A change of the light, also by a factor, is called that alone."""
+    pictures: list[np.ndarray] = recording([], 60)
+    y, x = np.mgrid[:48, :64]
+    stain = 30.0 * (np.hypot(x - 25, y - 20) < 10)[:, :, None]
+
+    def notes(factor: float, step: float | np.ndarray) -> list[str]:
+        later = [np.clip(factor * picture + step, 0, 255).astype(np.uint8) for picture in pictures[30:]]
+        return [note.partition(":")[0] for note in watched([*pictures[:30], *later], monkeypatch)[0]]
+
+    assert notes(1.0, 0.0) == []
+    assert notes(1.0, -stain) == notes(1.0, stain) == ["the untouched gel is not as at the start"]
+    for factor, step in ((0.7, 0.0), (1.3, 0.0), (1.0, -30.0), (1.0, 20.0)):
+        (note,) = notes(factor, step)
+        assert note.startswith("the light has changed by ")
+    assert len(notes(0.8, -stain)) == 2
 
 
 def submit(page: Tab, field: str, text: str) -> None:
