@@ -99,6 +99,22 @@ def test_dirt_that_is_darker_than_the_gel_is_said(monkeypatch: pytest.MonkeyPatc
     assert len(notes(0.8, -stain)) == 2
 
 
+def test_a_weak_and_a_clipped_press_are_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    pictures: list[np.ndarray] = recording([range(30, 50)], 75)
+    weak = [np.rint(0.4 * a + 0.6 * b).astype(np.uint8) for a, b in zip(pictures[30:50], pictures[:20], strict=True)]
+    assert watched([*pictures[:30], *weak, *pictures[50:]], monkeypatch)[1] == ["weak: press harder"]
+    for picture in pictures[30:50]:
+        picture[12:36, 16:32], picture[12:36, 32:48] = 0, 255
+    clipped = "clipped, 25% of values are 0 or 255: change light or exposure"
+    assert watched(pictures, monkeypatch)[1] == [clipped]
+
+
+def test_lost_pictures_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    pictures: list[np.ndarray] = recording([], 91)
+    assert watched(pictures, monkeypatch, range(1, 90, 8))[0] == ["it dropped 12 of the last 90 pictures"]
+    assert watched(pictures, monkeypatch, range(30, 33))[0] == []
+
+
 def submit(page: Tab, field: str, text: str) -> None:
     page.run(f"(f => {{ f.value = {text!r}; f.dispatchEvent(new Event('change')); f.form.requestSubmit() }})({field})")
 
