@@ -119,7 +119,7 @@ def adapt(
         "scores": {},
         "temperatures": made.temperatures or config.temperatures,
     }
-    update["trained_on"] = FITTED if catalogue is None and not config.calibrated else "videos"
+    update["trained_on"] = FITTED if catalogue is None and not config.rated else "videos"
     # Rounded up to the digits that config.json keeps, so that the farthest video itself is not flagged.
     farthest = max(distance(standardize(video.raw, made.statistics).double().numpy()) for video in encoded)
     update["usual"] = math.ceil(1e4 * farthest) / 1e4

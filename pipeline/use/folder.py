@@ -110,9 +110,14 @@ class ModelConfig(Record):
     """Of the libraries that it was made with."""
 
     @property
-    def calibrated(self) -> bool:
-        """Whether probabilities were calibrated on real videos."""
+    def rated(self) -> bool:
+        """Whether it met real videos with ratings."""
         return self.trained_on not in ("scenes", FITTED)
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether probabilities were calibrated on real videos; published heads come without temperatures."""
+        return self.rated and any(temperature != 1 for temperature in self.temperatures.values())
 
     def share(self, probability: float) -> str:
         """A probability of the heads; as a percentage only where it is calibrated."""

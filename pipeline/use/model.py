@@ -85,7 +85,7 @@ class Octopi:
         self._encoder_name = fingerprint(config.frames, *(part for file in files for part in file))
         bases = (config.base.folder, *([config.encoder.weights] if reads_weights(config.encoder) else []))
         self.doubts: tuple[str, ...] = (RANDOM,) if any(map(is_random, bases)) else ()
-        if not config.calibrated:
+        if not config.rated:
             self.doubts += (UNRATED if config.trained_on == FITTED else SYNTHETIC + on_real_videos(folder),)
 
     def __repr__(self) -> str:

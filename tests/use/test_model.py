@@ -224,6 +224,14 @@ def test_a_model_of_synthetic_touches_says_so_on_every_answer(octopi: Octopi, ma
     assert re.fullmatch(r"[^%]*score 0\.\d\d[^%]*", shown.shown)
 
 
+def test_heads_without_temperatures_give_scores_and_no_doubt(octopi: Octopi, made: Made, files: list[Path]) -> None:
+    published = configured(octopi, made, temperatures=dict.fromkeys(octopi.properties, 1.0))
+    assert octopi.describe(files[0], sentence=False).calibrated
+    assert not published.describe(files[0], sentence=False).calibrated
+    assert published.config.share(0.5) == "score 0.50"
+    assert published.doubts == ()
+
+
 BUMPY = {"a mug": ("hard", "smooth", "bumpy"), "a rug": ("soft", "rough", "no bumps")}
 
 
