@@ -110,7 +110,7 @@ class Chat:
     def _command(self, name: str, rest: str) -> None:
         match name:
             case "/add" if file := rest.strip():
-                touch = self.model.look(file)  # Refused here where it cannot be used, and not at the next question.
+                touch = self.model.touched(file).touch  # Refused here, and not at each question from now on.
                 self.added.setdefault(file, digest(Path(file)))
                 self._check_files()
                 self.waiting.append(file)

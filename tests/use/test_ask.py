@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from unittest import mock
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
@@ -15,7 +16,7 @@ from pipeline.running import progress
 from pipeline.use import ask as asking
 from pipeline.use.ask import Chat, describe_folder, described
 from pipeline.use.model import Octopi
-from tests.conftest import not_utf8, refused
+from tests.conftest import not_utf8, refused, write_video
 from tests.conftest import octopi as command
 from tests.report.conftest import rows_of
 from tests.use.shared import Made
@@ -89,6 +90,17 @@ def test_a_chat(octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(octopi, "stream", mock.Mock(side_effect=KeyboardInterrupt))
     assert "stopped" in type_("Hello?")
     assert not chat.history
+
+
+def test_a_chat_goes_on_without_a_video_in_which_nothing_is_touched(
+    octopi: Octopi, files: list[Path], tmp_path: Path
+) -> None:
+    said: list[str] = []
+    still = write_video(tmp_path / "still.avi", [np.full((36, 48, 3), 90, np.uint8)] * 12)
+    chat = Chat(octopi, said.append)
+    chat.run([f"/add {still}", f"/add {files[0]}", "How soft is it?"])
+    assert said[0].startswith(f"{still}: nothing touches the sensor")
+    assert [exchange.videos for exchange in chat.history] == [(str(files[0]),)]
 
 
 def test_a_chat_mixes_no_recordings_of_one_name(octopi: Octopi, files: list[Path], tmp_path: Path) -> None:
