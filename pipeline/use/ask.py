@@ -90,6 +90,11 @@ class Chat:
         self.added: dict[str, str] = {}
         """Files that were added, and the hash of what they held then."""
 
+    @property
+    def videos(self) -> list[Video]:
+        """Those of the conversation, and those that wait for the next question."""
+        return [*(v for exchange in self.history for v in exchange.videos), *self.waiting]
+
     def run(self, lines: Iterable[str]) -> None:
         """Answer line by line; what is wrong is said, and the conversation goes on."""
         for doubt in self.model.doubts:
@@ -118,13 +123,12 @@ class Chat:
                 many = len(self.waiting)
                 self.say(f"{many} for the next question: {{tactile}} once for each, or they stand in front\n")
             case "/frames":
-                videos = [*(v for exchange in self.history for v in exchange.videos), *self.waiting]
-                for video in videos:
+                for video in self.videos:
                     touch = self.model.look(video)
                     numbers = ", ".join(map(str, touch.numbers))
                     self.say(f"{video}: frames {numbers}; touched {touch.contact:.0%} of the picture\n")
                     self.say("".join(f"  {note}\n" for note in touch.notes))
-                if not videos:
+                if not self.videos:
                     self.say("no video yet: /add FILE\n")
             case "/reset":
                 self.history, self.waiting, self.added = [], [], {}
@@ -146,7 +150,8 @@ class Chat:
             said += piece
         heads = self.model.verdict(question, self.waiting)
         self.say(f"\n(property heads: {heads.shown})\n" if heads else "\n")
-        self.say("".join(f"note: {note}\n" for note in self.model.apart(said, heads)))
+        notes = (*self.model.apart(said, heads), *self.model.doubts_about(question, len(self.videos)))
+        self.say("".join(f"note: {note}\n" for note in notes if note not in self.model.doubts))
         self.history.append(Exchange(question, tuple(self.waiting), said))
         self.waiting = []
 

@@ -126,7 +126,7 @@ class Session:
         }
 
     async def stream(self, asked: Asked) -> AsyncIterator[str]:
-        """The answer in pieces, and behind `ASIDE` what the heads say; it stops where nobody listens any more.
+        """The answer in pieces, and behind `ASIDE` what heads and notes say; it stops where nobody listens any more.
 
         Raises:
             UserError: if the question does not fit, before the first piece.
@@ -136,6 +136,8 @@ class Session:
         (heads,) = await self.work(lambda: [self.model.verdict(asked.question, videos)])
         pieces = self.worker.answer(lambda: self.model.stream(asked.question, videos, history=turns))
         first = await anext(pieces, "")
+        shown = sum(len(turn.videos) for turn in turns) + len(videos)
+        notes = [note for note in self.model.doubts_about(asked.question, shown) if note not in self.model.doubts]
 
         async def rest() -> AsyncIterator[str]:
             said = first
@@ -145,8 +147,9 @@ class Session:
                     async for piece in pieces:
                         said += piece
                         yield piece
-                    if heads:
-                        yield ASIDE + ". ".join([f"Property heads: {heads.shown}", *self.model.apart(said, heads)])
+                    ruled = [f"Property heads: {heads.shown}", *self.model.apart(said, heads)] if heads else []
+                    if ruled or notes:
+                        yield ASIDE + ". ".join([*ruled, *notes])
                 except (UserError, Failed) as error:
                     yield f"\n[{error}]"
 

@@ -42,6 +42,7 @@ class FakeOctopi:
 
     name = "finetuned-with-all-0"
     config = SimpleNamespace(heads=True)
+    doubts = ("it is a fake",)
 
     def __init__(self, seconds: float = 0.0) -> None:
         self.seconds = seconds
@@ -65,6 +66,9 @@ class FakeOctopi:
 
     def apart(self, answer: str, heads: Verdict | None) -> tuple[str, ...]:
         return ("the sentence and the heads disagree",) if heads and "soft" not in answer else ()
+
+    def doubts_about(self, question: str, videos: int) -> tuple[str, ...]:
+        return (*self.doubts, *(("it compares one video",) if "softer" in question and videos == 1 else ()))
 
     def notes(self, videos: Sequence[Any], question: str = "") -> tuple[str, ...]:
         """As the real one's: behind the name of a file."""

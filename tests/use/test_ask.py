@@ -15,7 +15,7 @@ from pipeline.cli import app, main
 from pipeline.running import progress
 from pipeline.use import ask as asking
 from pipeline.use.ask import Chat, describe_folder, described
-from pipeline.use.model import Octopi
+from pipeline.use.model import ALONE, Octopi
 from tests.conftest import not_utf8, refused, write_video
 from tests.conftest import octopi as command
 from tests.report.conftest import rows_of
@@ -82,6 +82,9 @@ def test_a_chat(octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPat
     assert all(level in heads for level in octopi.describe(files[0]).levels.values())
     assert type_("And now?") == octopi.ask("And now?", history=chat.history[:1]) + "\n"
     assert [len(e.videos) for e in chat.history] == [1, 0]
+    assert ALONE in type_("Which is softer?")
+    type_(f"/add {files[1]}")
+    assert ALONE not in type_("Which is softer?")
     numbers = ", ".join(map(str, octopi.look(files[0]).numbers))
     assert f"{files[0]}: frames {numbers}" in type_("/frames")
     assert type_("/reset", QUESTION.replace("{tactile}", "it")).startswith("a new conversation\n")

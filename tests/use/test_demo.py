@@ -84,6 +84,10 @@ def test_an_answer_streams_with_its_history(site: str, session: Session, tmp_pat
         answer, heads = "".join(pieces).split(ASIDE)
         assert answer == rest
         assert heads == "Property heads: soft (50%). the sentence and the heads disagree"
+    for history, note in (([], ". it compares one video"), ([turn], "")):
+        asked = {"question": "Is {tactile} softer?", "touches": ids[:1], "history": history}
+        told = httpx2.post(f"{site}/api/ask", json=asked, timeout=HUNG).text.split(ASIDE)[1]
+        assert told == f"Property heads: soft (50%){note}"
     assert len(model.threads - {threading.get_ident()}) == 1, "one thread does all that the model does"
     model.gate = None
 
