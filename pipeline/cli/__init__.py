@@ -465,9 +465,10 @@ def rank(
     from pipeline.use.ask import videos_of
 
     videos = [file for file, _ in videos_of(paths)]
-    found = _load(model, base, device, property).rank(videos, property)
+    asked = _load(model, base, device, property)
+    found = asked.rank(videos, property)
     classes = ", ".join(f"{number} {level}" for number, level in enumerate(found.levels))
-    typer.echo(f"{found.property} by the property heads: {classes}")
+    typer.echo(f"{found.property} by the {asked.config.judge}: {classes}")
     for place in found.order:
         typer.echo(f"{found.expected[place]:.2f}  {videos[place]}")
     if found.answer:
@@ -492,9 +493,10 @@ def match(
     """Say which video is of which object: by the property heads, and in the model's own words."""
     from pipeline.use.ask import named_objects
 
-    found = _load(model, base, device).match(videos, named_objects(names))
+    asked = _load(model, base, device)
+    found = asked.match(videos, named_objects(names))
     for video, name in zip(videos, found.heads, strict=True):
-        typer.echo(f"{video}: {name} (by the property heads)")
+        typer.echo(f"{video}: {name} (by the {asked.config.judge})")
     if found.answer:
         typer.echo(found.answer)
     _print_notes(found.notes)

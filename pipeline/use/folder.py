@@ -119,6 +119,11 @@ class ModelConfig(Record):
         """Whether probabilities were calibrated on real videos; published heads come without temperatures."""
         return self.rated and any(temperature != 1 for temperature in self.temperatures.values())
 
+    @property
+    def judge(self) -> str:
+        """What names the classes of a video."""
+        return "property heads" if self.heads else "model's sentences"
+
     def share(self, probability: float) -> str:
         """A probability of the heads; as a percentage only where it is calibrated."""
         return f"{probability:.0%}" if self.calibrated else f"score {probability:.2f}"

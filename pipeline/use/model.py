@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 NUMBERED = re.compile(r"object \d+")
 ALONE = "the question compares, but there is one video: what it says of another is made up"
 APART = "the sentence and the property heads disagree; heads alone are right more often (the card has both)"
+DIVIDED = "the answer and the classes that the model's sentences name disagree"
 UNTOLD = "this variant was not trained to describe, so there is no sentence"
 MUTE = "its language model knows other properties and is not asked; property heads alone answer"
 RANDOM = "its base models are tiny and random, made to test the chain: no answer of it means anything"
@@ -337,9 +338,10 @@ class Octopi:
         elif len(videos) == 2:
             compared = self.compare(videos[0], videos[1], property)
             answer, most = compared.answer, {"yes": 0, "no": 1}.get(compared.choice or "")
+            notes += compared.notes
         order = sorted(range(len(videos)), key=lambda i: expected[i] if rising else -expected[i])
-        if most is not None and most != order[-1]:
-            notes.append(APART)
+        if most is not None and expected[most] != expected[order[-1]]:
+            notes.append(APART if self.config.heads else DIVIDED)
         return Ranking(
             property=known.name,
             levels=known.levels,
@@ -347,7 +349,7 @@ class Octopi:
             expected=tuple(expected),
             answer=answer,
             most=most,
-            notes=(*self.doubts, *notes),
+            notes=tuple(dict.fromkeys((*self.doubts, *notes))),
         )
 
     def match(self, videos: Sequence[Video], names: Sequence[str] | Mapping[str, Sequence[str]]) -> Matching:
@@ -384,7 +386,7 @@ class Octopi:
         answer = NUMBERED.sub(lambda name: called.get(name[0], name[0]), answer)
         untrained = () if len(listed) == 3 else ("it was trained to match three videos, not two",)
         untrained = untrained if self.config.speaks else (MUTE,)
-        apart = (APART,) if said not in (None, heads) else ()
+        apart = (APART if self.config.heads else DIVIDED,) if said not in (None, heads) else ()
         notes = (*untrained, *apart, *self.notes(videos))
         return Matching(question=question, answer=answer, names=said, heads=heads, notes=notes)
 

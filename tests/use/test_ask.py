@@ -15,7 +15,8 @@ from pipeline.cli import app, main
 from pipeline.running import progress
 from pipeline.use import ask as asking
 from pipeline.use.ask import Chat, describe_folder, described
-from pipeline.use.model import ALONE, Octopi
+from pipeline.use.model import ALONE, DIVIDED, Octopi
+from pipeline.use.results import Description
 from tests.conftest import not_utf8, refused, write_video
 from tests.conftest import octopi as command
 from tests.report.conftest import rows_of
@@ -215,6 +216,34 @@ def test_described_compared_ranked_and_matched_by_command(
         *lines, answer = said("match", one, two, "--names", named).rstrip("\n").split("\n")
         assert answer == matched.answer
         assert [line.partition(": ")[2].partition(" (")[0] for line in lines] == list(matched.heads)
+
+
+def test_nobody_speaks_of_heads_that_are_not_there(
+    by_command: Command, octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Classes are then those of the model's sentences; where two videos are alike, either may be the hardest."""
+    soft, hard = ("soft", "rough", "no bumps"), ("hard", "smooth", "no bumps")
+    classes = dict(zip(map(str, files), (soft, hard, hard), strict=True))
+    found = {
+        file: Description(
+            levels=dict(zip(octopi.properties, own, strict=True)), probabilities={}, sentence="", frames=(), notes=()
+        )
+        for file, own in classes.items()
+    }
+    monkeypatch.setattr(octopi, "config", octopi.config.model_copy(update={"heads": False}))
+    monkeypatch.setattr(octopi, "describe", lambda video: found[str(video)])
+
+    def said(answer: str, *words: object) -> Result:
+        monkeypatch.setattr(octopi, "ask", mock.Mock(return_value=answer))
+        result = by_command(*words)
+        assert "property heads" not in result.output
+        assert "by the model's sentences" in result.stdout
+        return result
+
+    for place, apart in (("a", True), ("b", False), ("c", False)):
+        assert (DIVIDED in said(f"{place}) is the hardest.", "rank", "hardness", *files).stderr) == apart
+    own = "a mug: hard, smooth, no bumps; a rug: soft, rough, no bumps"
+    assert DIVIDED in said("a) is a mug and b) is a rug.", "match", *files[:2], "--names", own).stderr
 
 
 def test_a_kill_loses_no_row(octopi: Octopi, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -212,6 +212,16 @@ def test_what_the_heads_say_stands_beside_an_answer(
     assert octopi.apart(same, heads) == octopi.apart("I cannot say.", heads) == ()
 
 
+def test_two_ranked_are_two_compared(octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A ranking has the comparison's notes, each once."""
+    found = {file: Classified((p, ONE, TWO), (n, 2, 2)) for n, file, p in ((0, files[0], ONE), (1, files[1], TWO))}
+    monkeypatch.setattr(octopi.encoder, "classify", found.__getitem__)
+    monkeypatch.setattr(octopi, "doubts", ("a doubt",))
+    for answer in ("Both objects are similar in hardness.", "Yes, the first object is harder."):
+        monkeypatch.setattr(octopi, "ask", mock.Mock(return_value=answer))
+        assert octopi.rank(files[:2], "hardness").notes == ("a doubt", model_code.APART)
+
+
 def test_a_model_of_synthetic_touches_says_so_on_every_answer(octopi: Octopi, made: Made, files: list[Path]) -> None:
     synthetic = configured(octopi, made, trained_on="scenes")
     (note,) = synthetic.doubts
