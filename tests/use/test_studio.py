@@ -169,6 +169,11 @@ def test_record_rate_adapt_and_ask_in_a_browser(tmp_path: Path) -> None:
             page.until("document.querySelectorAll('.touch .sentence').length === 2")
             page.run("document.querySelector('#both').click()")
             page.until("document.querySelectorAll('#compared tr').length === 3")
+            assert page.run("document.querySelectorAll('#compared td').length") == 6
+            page.run("was = post; post = async (...all) => (await was(...all)).map(one => ({...one, answer: ''}))")
+            page.run("document.querySelector('#both').click()")
+            page.until("document.querySelectorAll('#compared td').length === 3")
+            assert "language" not in page.run("post = was; document.querySelector('#compared').textContent")
             page.type("#question", "Which is softer?")
             page.until("document.querySelector('.model') && !document.querySelector('#send').disabled")
             page.run("document.querySelector('[data-part=record]').click(); window.prompt = () => 'a big brick'")

@@ -275,15 +275,15 @@ async function compare() {
   tell("Compares ...", true);
   const found = await act("compare", {a: a.id, b: b.id});
   if (!found) return;
-  const table = make("table");
+  const table = make("table"), spoke = found.some(one => one.answer);  // Else the language model is not asked.
   table.append(...found.map(one => {
     const line = make("tr"), values = one.expected.map(value => value.toFixed(1)).join(" and ");
-    line.append(make("th", "", spoken(one.property)), make("td", "", values),
-      make("td", "", one.answer.split("Conclusion:").at(-1)));
+    line.append(make("th", "", spoken(one.property)), make("td", "", values));
+    if (spoke) line.append(make("td", "", one.answer.split("Conclusion:").at(-1)));
     return line;
   }));
   $("compared").replaceChildren(make("h2", "", `${a.name} and ${b.name}`),
-    make("p", "note", "Expected classes by the property heads, and what the language model concludes"), table);
+    make("p", "note", `Expected classes by the property heads${spoke ? ", and what the language model concludes" : ""}`), table);
 }
 
 function open(name) {
