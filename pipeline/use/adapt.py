@@ -112,7 +112,7 @@ def adapt(
             raise UserError(f"{counted(len({*objects}), 'rated object')} with touches; heads need two, better {MORE}")
     encoded = [video for video in encoded if video.touched]
     if sum(len(video.raw) for video in encoded) < 2:
-        raise UserError("one frame has no deviation; name more videos")
+        raise UserError("fewer than two frames with touches have no deviation; name more videos")
     made = _without_ratings(model, encoded) if catalogue is None else _rated(model, encoded, catalogue, objects, seed)
     update: dict[str, Any] = {
         "variant": to.name,

@@ -153,6 +153,11 @@ class RatedFolder:
         self.save([*(row for row in others if row["object_id"] != old), *given.values()], {new: line})
         return names.get(old, old.replace("_", " ")), moved
 
+    def rated(self) -> set[str]:
+        """Ids of objects with videos, and with a class of every property from somebody."""
+        listed = {row["object_id"] for row in self._read(OBJECTS, ["object_id"])}
+        return listed & {video["object_id"] for video in self.recorded()}
+
     def agreement(self, rows: Sequence[Row]) -> dict[str, tuple[float, float, float] | None]:
         """By property ICC(3,k) of ratings, with its interval; None where undefined.
 

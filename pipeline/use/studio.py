@@ -314,19 +314,26 @@ class Studio(Session):
     # ---- adapt and ask ----
 
     async def adapt(self) -> str:
-        """Adapt the model to all rated videos, as a new copy beside the older ones, and ask that from now on."""
+        """Adapt the model to all rated videos, as a new copy beside the older ones, and ask that from now on.
+
+        Heads are read from two rated objects on; with fewer it is adapted by all videos alone.
+        """
         return str(await self.work(self._adapt))
 
     def _adapt(self) -> str:
         try:
-            catalogue = load_catalogue(self.data.catalogue)
-            found, model = rated_videos([self.data.videos], catalogue), self.load(None)
+            rated, model = len(self.data.rated()), self.load(None)
+            catalogue = load_catalogue(self.data.catalogue) if rated > 1 else None
+            every = {self.data.videos / video["file"]: video["object_id"] for video in self.data.recorded()}
+            found = rated_videos([self.data.videos], catalogue) if catalogue else every
             for number, video in enumerate(found, 1):
                 self.busy = f"reads video {number} of {len(found)}"
                 model.look(video)
-            self.busy = "fits property heads"
+            self.busy = "fits the model to them"
             to = self.copies / time.strftime("%Y%m%d-%H%M%S")
-            self.told = adapt(model, [*found], to, catalogue=catalogue, objects=[*found.values()])
+            told = adapt(model, [*found], to, catalogue=catalogue, objects=[*found.values()])
+            alone = f"Rated objects: {rated}. Ratings count from two on, so videos alone were used.\n"
+            self.told = told if catalogue else alone + told
             self.model = self.load(str(to))
             return self.told
         finally:

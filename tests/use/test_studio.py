@@ -1,5 +1,7 @@
 """The studio: a camera that is odd in every way, and the whole page in a real browser, killed in the middle."""
 
+import asyncio
+import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,13 +13,15 @@ import numpy as np
 import pytest
 
 from pipeline.use import live, studio
-from pipeline.use.studio import Sensor
+from pipeline.use.folder import FITTED
+from pipeline.use.model import Octopi
+from pipeline.use.studio import Sensor, Studio
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.film import write_film
 from pipeline.videos.frames.reference import LONGEST
 from pipeline.videos.importing.presses import Shot
 from tests.checkpoints import model_folder
-from tests.conftest import HUNG, wait_for
+from tests.conftest import HUNG, ROOT, wait_for
 from tests.use.browser import Tab, tab
 from tests.use.fake import Running
 from tests.use.test_live import Camera, shots
@@ -113,6 +117,30 @@ def test_lost_pictures_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     pictures: list[np.ndarray] = recording([], 91)
     assert watched(pictures, monkeypatch, range(1, 90, 8))[0] == ["it dropped 12 of the last 90 pictures"]
     assert watched(pictures, monkeypatch, range(30, 33))[0] == []
+
+
+def test_it_is_adapted_by_ratings_from_two_rated_objects_on(tmp_path: Path) -> None:
+    """With fewer it is adapted by all videos alone, and the page is told so."""
+    (videos := tmp_path / "folder" / "videos").mkdir(parents=True)
+    for name, example in (("foam", "soft"), ("brick", "hard"), ("unknown", "rough")):
+        shutil.copy(ROOT / "examples" / f"{example}.mp4", videos / f"{name}_0.mp4")
+
+    def load(copy: str | None) -> Octopi:
+        return Octopi.from_pretrained(copy, base=model_folder("smollm2"), device="cpu")
+
+    lab = Studio(load, tmp_path / "folder", str(ROOT / "examples" / "soft.mp4"), 2.0)
+    try:
+        for count, name in enumerate(("", "foam", "brick")):
+            for place, property in enumerate(lab.data.names if name else ()):
+                lab.rate("ann", name, property, CLASSES[name][place])
+            told = asyncio.run(lab.adapt())
+            assert lab.state()["told"] == told
+            alone = [f"Rated objects: {count}. Ratings count", "standardised by 3 videos, without a label"]
+            assert all(words in told for words in alone if count < 2)
+            assert ("2 rated objects (2 videos)" in told) == (count == 2)
+            assert lab.model.config.trained_on == ("videos" if count == 2 else FITTED)
+    finally:
+        lab.close()
 
 
 def submit(page: Tab, field: str, text: str) -> None:
