@@ -28,7 +28,7 @@ def write_film(path: Path, frames: Iterable[npt.NDArray[np.uint8]], fps: float) 
 
     Equal frames give equal files on one machine.
     """
-    rate = Fraction(fps).limit_denominator(1000)
+    rate = Fraction(fps).limit_denominator(min(1000, int(65535 / fps)))  # MPEG-4 has no larger numerator.
     try:
         with av.open(f"file:{path}", "w", options={"fflags": "+bitexact"}) as container:
             stream = container.add_stream("mpeg4", rate=rate)
