@@ -25,15 +25,12 @@ from pipeline.core.io import atomic, remove_rests, write_text
 from pipeline.running.errors import UserError, first_problem
 from pipeline.videos.audit.labels import icc3k
 from pipeline.videos.catalogue import OBJECTS, PROPERTIES
-from pipeline.videos.catalogue.csv_reader import Row, read_rows
+from pipeline.videos.catalogue.csv_reader import LONGEST_ID, Row, read_rows
 from pipeline.videos.catalogue.wording import Language
 from pipeline.videos.files import LIST_FILE, video_files
 from pipeline.videos.importing.presses import first_free
 
 log = logging.getLogger(__name__)
-LONGEST_ID = 100
-"""Letters of an object's id, which file names begin with."""
-
 RATINGS = "ratings.csv"
 ASIDE = ".deleted"
 """Where deleted videos wait for an undo, until the folder is opened again."""
@@ -90,10 +87,9 @@ class RatedFolder:
         known = {row["name"].lower(): row["object_id"] for row in self._read(OBJECTS, ["object_id", "name"])}
         plain = unicodedata.normalize("NFC", name).strip().lower()
         key = known.get(plain) or re.sub(r"[^\w-]+", "_", plain).strip("_-")
-        if 0 < len(key) <= LONGEST_ID:
+        if 0 < len(os.fsencode(key)) <= LONGEST_ID:
             return key
-        told = f"write one of up to {LONGEST_ID} letters, with its article, such as: a block of foam"
-        raise UserError(f"{name[:LONGEST_ID]!r}: no name for an object; {told}")
+        raise UserError(f"{name[:50]!r}: no name for an object; write a short one, such as: a block of foam")
 
     def save(self, rows: Sequence[Row], called: Mapping[str, Row] = MappingProxyType({})) -> None:
         """Write ratings.csv, and objects.csv with each object that has a class of every property from somebody.

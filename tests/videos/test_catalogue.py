@@ -99,6 +99,7 @@ def write(folder: Path, *lines: str, encoding: str = "utf-8", **more: Sequence[s
         ([HEADER, GOOD.replace("1 1 2", "-1")], "line 2.*hardness.*0 to 2"),
         ([HEADER, GOOD.replace("train,train", "train,trian")], "line 2.*split_release.*trian.*validation"),
         ([HEADER, GOOD.replace("ball,", "../../evil,", 1)], r"line 2.*'\.\./\.\./evil'.*letters, digits"),
+        ([HEADER, GOOD.replace("ball,", "b" * 151 + ",", 1)], r"line 2: object 'b{50}' .151 bytes. names files"),
         ([f"{SHORT},label_hardnes", f"{BALL},1"], r"objects\.csv.*label_hardnes .*no property"),
     ],
 )

@@ -138,6 +138,8 @@ def test_what_is_wrong_is_named_with_its_mend(layout: str, tmp_path: Path) -> No
     refuses(f"info.json: no video gelsight; .*its videos: {GEL}, {WRIST}", key="gelsight")
     refuses("nowhere/meta/info.json: is missing; name a LeRobot dataset's folder", tmp_path / "nowhere")
     refuses("names.csv.* has no task 'press the bell'; correct the line", names=table)
+    table.write_text(f"episode,object_id\n0,{'ö' * 76}\n")
+    refuses("episode 0: object 'ö{50}' .152 bytes. .*, up to 150 bytes; name it in a CSV", names=table)
     video.write_bytes(video.read_bytes()[:-1000])
     refuses(f"{video.name}: (no whole video|lacks) .*; download the dataset again")
     video.unlink()

@@ -20,7 +20,7 @@ from pydantic import Field, ValidationError
 from pipeline.core.records import Part, Record
 from pipeline.core.runtime import derive_seed
 from pipeline.running.errors import UserError, first_problem
-from pipeline.videos.catalogue.csv_reader import Row, read_rows
+from pipeline.videos.catalogue.csv_reader import Row, check_object_id, read_rows
 from pipeline.videos.catalogue.wording import OPENING, Language, Property, Scenario
 
 __all__ = ["Catalogue", "Language", "Object", "Property", "Scenario", "load_catalogue"]
@@ -206,8 +206,7 @@ def _split_columns(file: Path, header: Sequence[str], language: Language) -> dic
 def _read_object(row: Row, language: Language, splits: dict[str, str], where: str) -> Object:
     if not row["object_id"] or not row["name"]:
         raise UserError(f"{where}: object_id and name must not be empty")
-    if not re.fullmatch(r"[\w-]+", row["object_id"]):
-        raise UserError(f"{where}: object_id {row['object_id']!r} names files; write letters, digits, _ and - alone")
+    check_object_id(where, row["object_id"])
     ratings, stated = [], []
     for p in language.properties:
         most = len(p.levels) - 1

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import os
+import re
 from collections.abc import Sequence
 from itertools import zip_longest
 from pathlib import Path
@@ -10,6 +12,16 @@ from pathlib import Path
 from pipeline.running.errors import UserError
 
 Row = dict[str, str]
+LONGEST_ID = 150
+"""Bytes of an object's id at most: names of files begin with it, and have up to 255."""
+
+
+def check_object_id(where: str, object_id: str, mend: str = "") -> None:
+    """Raise UserError for an id that names of files cannot begin with; `mend` says where to write another."""
+    size = len(os.fsencode(object_id))
+    if size > LONGEST_ID or re.fullmatch(r"[\w-]+", object_id) is None:
+        wanted = f"take letters, digits, _ and - alone, up to {LONGEST_ID} bytes"
+        raise UserError(f"{where}: object {object_id[:50]!r} ({size} bytes) names files; {wanted}{mend}")
 
 
 def read_rows(file: Path, needed: Sequence[str]) -> tuple[list[str], list[tuple[str, Row]]]:

@@ -17,7 +17,7 @@ import pandas as pd
 
 from pipeline.core.io import remove_rests
 from pipeline.running.errors import UserError, counted, did_you_mean
-from pipeline.videos.catalogue.csv_reader import read_rows
+from pipeline.videos.catalogue.csv_reader import check_object_id, read_rows
 from pipeline.videos.decoding import CONTAINERS, video_stream
 from pipeline.videos.files import LIST_FILE, add_to_list, check_extensible
 from pipeline.videos.importing.presses import NothingTouchesError, cut, film, first_free
@@ -154,9 +154,7 @@ def _object_ids(root: Path, found: Sequence[Episode], table: Path | None) -> dic
         if len(ids) < len(found):
             log.warning("%s: lacks %d of %d episodes, which are left out", table, len(found) - len(ids), len(found))
     for number, object_id in ids.items():
-        if re.fullmatch(r"[\w-]+", object_id) is None:
-            wanted = "letters, digits, _ and -; say another with --objects"
-            raise UserError(f"{table or root}: episode {number} has object {object_id!r}; take {wanted}")
+        check_object_id(f"{table or root}: episode {number}", object_id, "; name it in a CSV, with --objects")
     return ids
 
 

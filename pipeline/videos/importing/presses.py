@@ -26,7 +26,7 @@ from pipeline.core.records import Record
 from pipeline.running.errors import UserError
 from pipeline.videos import decoding
 from pipeline.videos.audit.files import FOUND
-from pipeline.videos.catalogue.csv_reader import Row, read_rows
+from pipeline.videos.catalogue.csv_reader import Row, check_object_id, read_rows
 from pipeline.videos.decoding import Decoder, Image
 from pipeline.videos.files import SECTION, add_to_list, check_extensible, is_video
 from pipeline.videos.film import write_film
@@ -108,8 +108,7 @@ def cut(
     Raises:
         UserError: if the recording cannot be read, or nothing touches the sensor.
     """
-    if re.fullmatch(r"[\w-]+", object_id) is None:
-        raise UserError(f"{name}: object {object_id!r}: take letters, digits, _ and -, as in objects.csv")
+    check_object_id(name, object_id)
     stamped, received, strengths = _measure(read())
     if len(received) < SHORTEST:
         raise NothingTouchesError(
