@@ -307,7 +307,11 @@ def test_a_table_says_where_to_cut(tmp_path: Path, pictures: list[np.ndarray], c
     octopi("import", "video", table, "--out", out)
     listed = [f.relative for f in list_videos(out, catalogue).files]
     assert listed == ["rug_0.mp4", "rug_1.mp4", "rug_2.mp4"], "what the list had, and what it has now"
-    for cells, told in (("rug,inf", "line 3: begin is 'inf'"), ("a rug,0", "line 2: object 'a rug' .* take letters")):
+    for cells, told in (
+        ("rug,inf", "line 3: begin is 'inf'"),
+        ("a rug,0", "line 2: object 'a rug' .* take letters"),
+        ("rug,9", "line 2: 0 pictures are no press"),
+    ):
         table.write_text(f"file,object_id,begin\nlong.mp4,{'rug,1' if 'inf' in cells else cells}\nlong.mp4,{cells}\n")
         with refused(told):
             octopi("import", "video", table, "--out", out)

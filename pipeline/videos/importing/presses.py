@@ -109,11 +109,7 @@ def cut(
         UserError: if the recording cannot be read, or nothing touches the sensor.
     """
     check_object_id(name, object_id)
-    stamped, received, strengths = _measure(read())
-    if len(received) < SHORTEST:
-        raise NothingTouchesError(
-            f"{name}: {len(received)} pictures are no press; record from before the contact to its end"
-        )
+    stamped, received, strengths = _measure(name, read())
     ranges = [(0, len(strengths))] if whole else presses(strengths, times)
     if not ranges:
         raise NothingTouchesError(
@@ -304,7 +300,7 @@ def presses(strengths: npt.NDArray[np.float64], times: float = FOUND) -> list[tu
     ]
 
 
-def _measure(source: Iterator[Shot]) -> tuple[list[int], list[int], npt.NDArray[np.float64]]:
+def _measure(name: str, source: Iterator[Shot]) -> tuple[list[int], list[int], npt.NDArray[np.float64]]:
     """Stamps, times of arrival (ns) and contact strengths of all pictures, against the untouched picture at one end.
 
     First pictures in which the light still changes count as quiet.
@@ -314,6 +310,9 @@ def _measure(source: Iterator[Shot]) -> tuple[list[int], list[int], npt.NDArray[
         stamped.append(shot.stamped)
         received.append(shot.recorded)
         thumbs.append(shot.thumb())
+    if len(thumbs) < SHORTEST:
+        wanted = "begin before the contact, and end behind it"
+        raise NothingTouchesError(f"{name}: {len(thumbs)} pictures are no press; {wanted}")
     places, cold = reference_indices(len(thumbs)), unsteady_frames(thumbs, len(thumbs)) % len(thumbs)
     first, last = mean([thumbs[cold + i] for i in places]), mean([thumbs[-1 - i] for i in places])
     reference = last if starts_touching(first, last) else first
