@@ -227,10 +227,12 @@ def bag(
     times: Times = 2.0,
 ) -> None:
     """Cut a robot's recording into presses: videos for the chain and `octopi ask`, each with its times in a CSV."""
+    from pipeline.videos.files import extending
     from pipeline.videos.importing.bags import shots
     from pipeline.videos.importing.presses import cut_into
 
-    written = cut_into(lambda: shots(file, topic), f"{file}, {topic}", out, object_id or file.stem, times)
+    with extending(out):
+        written = cut_into(lambda: shots(file, topic), f"{file}, {topic}", out, object_id or file.stem, times)
     typer.echo(f"{len(written)} presses in {out}: {', '.join(path.name for path in written)}")
 
 
@@ -249,12 +251,14 @@ def video(
 
     A table (file, object_id, begin and end in seconds, session) says itself where to cut: one video a line.
     """
+    from pipeline.videos.files import extending
     from pipeline.videos.importing.presses import cut_into, cut_listed, film
 
-    if file.suffix.lower() == ".csv":
-        written = cut_listed(file, out, fps)
-    else:
-        written = cut_into(lambda: film(file, fps), str(file), out, object_id or file.stem, times, whole=whole)
+    with extending(out):
+        if file.suffix.lower() == ".csv":
+            written = cut_listed(file, out, fps)
+        else:
+            written = cut_into(lambda: film(file, fps), str(file), out, object_id or file.stem, times, whole=whole)
     typer.echo(f"{counted(len(written), 'video')} in {out}: {', '.join(path.name for path in written)}")
 
 
@@ -270,9 +274,11 @@ def lerobot(
     times: Times = 4.0,
 ) -> None:
     """Make a video of each episode, where possible without encoding it anew, and a `videos.csv`."""
+    from pipeline.videos.files import extending
     from pipeline.videos.importing.lerobot import import_episodes
 
-    written = import_episodes(dataset, video, out, objects, times, pressed=pressed)
+    with extending(out):
+        written = import_episodes(dataset, video, out, objects, times, pressed=pressed)
     typer.echo(f"{counted(len(written), 'new video')} in {out}: {', '.join(path.name for path in written)}")
 
 

@@ -8,10 +8,13 @@ import posixpath
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
+
+from filelock import FileLock, Timeout
 
 from pipeline.core.io import atomic
 from pipeline.running.errors import UserError, readable
@@ -94,11 +97,22 @@ def list_videos(folder: Path, catalogue: Catalogue) -> Listing:
     return Listing(tuple(files), tuple(findings), tuple(sorted(unknown)))
 
 
-def check_extensible(folder: Path) -> None:
-    """Raise UserError where a folder's videos.csv is unreadable, or a table of sections, which lines would spoil."""
-    listed = folder / LIST_FILE
+@contextmanager
+def extending(folder: Path) -> Iterator[None]:
+    """Let one import at a time add videos to a folder: two would give the same numbers, and lose lines of its list.
+
+    UserError where another one runs, or its videos.csv is unreadable, or a table of sections, which lines would spoil.
+    """
+    listed, lock = folder / LIST_FILE, folder / ".import.lock"
     if listed.is_file() and {*SECTION} & {*read_rows(listed, ("file", "object_id"))[0]}:
         raise UserError(f"{listed}: names sections of files, and would be lost; name another --out")
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(lock, timeout=0), ExitStack() as end:
+            end.callback(lock.unlink, missing_ok=True)
+            yield
+    except Timeout:
+        raise UserError(f"{folder}: another import writes into it; wait for it, or name another --out") from None
 
 
 def add_to_list(folder: Path, rows: Sequence[Mapping[str, str]]) -> None:

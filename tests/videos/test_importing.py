@@ -17,7 +17,7 @@ from pipeline.core.io import read_csv
 from pipeline.running.errors import UserError
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.decoding import Decoder
-from pipeline.videos.files import list_videos
+from pipeline.videos.files import extending, list_videos
 from pipeline.videos.film import write_film
 from pipeline.videos.frames.reference import LONGEST
 from pipeline.videos.importing.bags import shots
@@ -320,6 +320,9 @@ def test_a_table_says_where_to_cut(tmp_path: Path, pictures: list[np.ndarray], c
     assert len([*out.glob("*.mp4")]) == 4, "nothing is written where a line is wrong"
     octopi("import", "video", tmp_path / "long.mp4", "--out", out, "--object", "rug", "--whole")
     assert "rug_3.mp4" in [f.relative for f in list_videos(out, catalogue).files], "the list goes on"
+    with extending(out), refused("cut: another import writes into it"):
+        octopi("import", "video", tmp_path / "long.mp4", "--out", out, "--object", "rug", "--whole")
+    assert [*out.glob(".*")] == [], "no lock is left"
 
 
 def test_presses_are_written_all_or_none(tmp_path: Path, pictures: list[np.ndarray]) -> None:

@@ -19,7 +19,7 @@ from pipeline.core.io import remove_rests
 from pipeline.running.errors import UserError, counted, did_you_mean
 from pipeline.videos.catalogue.csv_reader import check_object_id, read_rows
 from pipeline.videos.decoding import CONTAINERS, video_stream
-from pipeline.videos.files import LIST_FILE, add_to_list, check_extensible
+from pipeline.videos.files import LIST_FILE, add_to_list
 from pipeline.videos.importing.presses import NothingTouchesError, cut, film, first_free
 
 log = logging.getLogger(__name__)
@@ -66,7 +66,6 @@ def import_episodes(
     """
     found = read_episodes(root, key)
     names, listed = _object_ids(root, found, objects), out / LIST_FILE
-    check_extensible(out)
     lines = [row for _, row in read_rows(listed, ("file", "object_id"))[1]] if listed.exists() else []
     known = {row["session"] for row in lines if row.get("video") == key and "session" in row}
     if known:

@@ -28,7 +28,7 @@ from pipeline.videos import decoding
 from pipeline.videos.audit.files import FOUND
 from pipeline.videos.catalogue.csv_reader import Row, check_object_id, read_rows
 from pipeline.videos.decoding import Decoder, Image
-from pipeline.videos.files import SECTION, add_to_list, check_extensible, is_video
+from pipeline.videos.files import SECTION, add_to_list, is_video
 from pipeline.videos.film import write_film
 from pipeline.videos.frames.reference import (
     LONGEST,
@@ -151,7 +151,6 @@ def cut_into(
     read: Callable[[], Iterator[Shot]], name: str, out: Path, object_id: str, times: float, *, whole: bool = False
 ) -> list[Path]:
     """`cut` into a folder whose list, where it has one, goes on."""
-    check_extensible(out)
     written = cut(read, name, out, object_id, times, whole=whole)
     add_to_list(out, [{"file": path.name, "object_id": object_id} for path in written])
     return written
@@ -172,10 +171,9 @@ def cut_listed(listed: Path, out: Path, fps: float = 0.0) -> list[Path]:
         fps: As `film`'s.
 
     Raises:
-        UserError: as of `cut`, or where the folder's list is a table of sections.
+        UserError: as of `cut`.
     """
     _, rows = read_rows(listed, ("file", "object_id"))
-    check_extensible(out)
     sections = [[_seconds(where, column, row.get(column, "")) for column in SECTION] for where, row in rows]
     written, lines = list[Path](), list[Row]()
     try:
