@@ -113,14 +113,12 @@ class TaskDefinition(ABC):
         """
         return None
 
-    def adjective(self, question: Question | Draft, catalogue: Catalogue) -> str:
-        """The adjective that the question asks by, such as "softer"; empty where it asks by none."""
-        if not self.adjectives:
-            return ""
+    def adjective(self, question: Question | Draft, catalogue: Catalogue) -> tuple[str, str]:
+        """The adjective that the question asks by, such as "softer", and its opposite."""
         prop = catalogue.properties[catalogue.property_index(question.gold.properties[0])]
         high, low = (getattr(prop, field) for field in self.adjectives)
-        asked: str = high if mentioned(question.dialogues[0].turns[-1].user, (high, low)) == [plain(high)] else low
-        return asked
+        rising = mentioned(question.dialogues[0].turns[-1].user, (high, low)) == [plain(high)]
+        return (high, low) if rising else (low, high)
 
     def chance(self, catalogue: Catalogue) -> dict[str, float]:
         """Accuracy of a uniform guess, 0 to 1, by measure."""

@@ -11,6 +11,7 @@ from pipeline.tasks import base, psr
 from pipeline.tasks.base import Classes, Draft, Pool, TaskDefinition
 from pipeline.tasks.records import Score
 from pipeline.videos.catalogue import Catalogue, Property
+from pipeline.videos.catalogue.wording import plain
 
 TEMPLATES = (
     "Is the object in the tactile video {tactile} COMPARATIVE than the one in {tactile}?",
@@ -44,12 +45,18 @@ def in_words(choice: Reading, comparative: str, prop: Property) -> str:
     }[choice]
 
 
-def read(answer: str) -> Reading | None:
-    """One of `CHOICES`, from how the conclusion begins: "Yes", "No" or "Both"; "yes and no" is none of them."""
+def read(answer: str, comparative: str, opposite: str) -> Reading | None:
+    """One of `CHOICES`, from how the conclusion begins: "Yes", "No" or "Both"; "yes and no" is none of them.
+
+    Nor is what contradicts itself: asked which one is softer, "Yes, the first object is harder.".
+    """
     pattern = r"\W*(yes|no|both)\b(?!\s*(?:and|or|/)\s*(?:yes|no|both)\b|\s+(?:idea|answer|conclusion|clue)\b)"
-    found = {m[1].lower() for part in base.conclusion(answer) if (m := re.match(pattern, part, flags=re.IGNORECASE))}
+    parts, (asked, other) = base.conclusion(answer), map(plain, (comparative, opposite))
+    found = {m[1].lower() for part in parts if (m := re.match(pattern, part, flags=re.IGNORECASE))}
+    named = rf"{base.BEGUN}the (first|second) object is ({re.escape(asked)}|{re.escape(other)})(?!\w)"
+    said = {"no" if (x == "first") == (y == other) else "yes" for x, y in re.findall(named, plain(" ".join(parts)))}
     readings: dict[str, Reading] = {"yes": "yes", "no": "no", "both": "same"}
-    return readings[found.pop()] if len(found) == 1 else None
+    return readings[found.pop()] if len(found) == 1 and said <= found else None
 
 
 class PropertyComparison(TaskDefinition):
@@ -91,7 +98,7 @@ class PropertyComparison(TaskDefinition):
 
     def plainly(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
         """ "Which is softer?", videos in front or behind, which is answered by the name of one, or by "Both"."""
-        comparative = self.adjective(draft, catalogue)
+        comparative, _ = self.adjective(draft, catalogue)
         places = ("{{tactile}} {{tactile}} Which is {}?", "Which is {}? {{tactile}} {{tactile}}")
         user, dialogues = rng.choice(places).format(comparative), []
         for dialogue in draft.dialogues:
@@ -106,19 +113,20 @@ class PropertyComparison(TaskDefinition):
         if draft.gold.choice == "same":
             return None
         spoken = catalogue.properties[catalogue.property_index(draft.gold.properties[0])].spoken
-        question = f"Which object is {self.adjective(draft, catalogue)}?"
+        question = f"Which object is {self.adjective(draft, catalogue)[0]}?"
         ask = psr.REQUEST.format(question=question, based=psr.BASED)
         turn = Turn(user=ask, assistant=psr.in_words("ab"[draft.gold.choice == "no"], spoken))
         return draft.with_dialogues(Dialogue(opd=d.opd, turns=(turn,)) for d in draft.dialogues)
 
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
-        place, word = catalogue.property_index(question.gold.properties[0]), self.adjective(question, catalogue)
+        place, (word, _) = catalogue.property_index(question.gold.properties[0]), self.adjective(question, catalogue)
         prop = catalogue.properties[place]
         (first, _), (second, _) = (video[place] for video in classes)
         return in_words(compare(first, second, word == prop.more), word, prop)
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
-        return base.choice_score(question, prediction, read(prediction.outputs[0]), published=True)
+        said = read(prediction.outputs[0], *self.adjective(question, catalogue))
+        return base.choice_score(question, prediction, said, published=True)
 
 
 TASK = PropertyComparison()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 
 from pipeline.core.records import Opd, Prediction, Question
 from pipeline.tasks import base
@@ -27,10 +28,13 @@ def asked(template: tuple[str, str], superlative: str, spoken: str) -> dict[Opd,
     }
 
 
-def read(answer: str) -> str | None:
-    """The one letter that the conclusion calls the superlative."""
+def read(answer: str, opposite: str = "") -> str | None:
+    """The one letter that the conclusion calls the superlative, and not also the `opposite` of what was asked for."""
     named = (r"CHOICE is (?:\w+ly )?the\b(?! same)", r"(?:\w+est|(?:most|least) \w+)(?: \w+)? is CHOICE")
-    return base.chosen_letter(answer, base.LETTERS, *named, concluded=True)
+    letter, other = base.chosen_letter(answer, base.LETTERS, *named, concluded=True), re.escape(opposite)
+    contrary = rf"{base.CHOICE} is (?:\w+ly )?the {other}\b|\b{other}(?: \w+)? is {base.CHOICE}"
+    said = re.findall(contrary, " ".join(base.conclusion(answer)), re.I) if opposite else []
+    return None if letter in {name.lower() for names in said for name in names} else letter
 
 
 class PropertySuperlativeSelection(TaskDefinition):
@@ -66,13 +70,14 @@ class PropertySuperlativeSelection(TaskDefinition):
         return base.draft_about(pool, objects, rng, turns=turns, choice=letter, properties=[prop.name], finding=finding)
 
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
-        place, word = catalogue.property_index(question.gold.properties[0]), self.adjective(question, catalogue)
+        place, (word, _) = catalogue.property_index(question.gold.properties[0]), self.adjective(question, catalogue)
         furthest = max if word == catalogue.properties[place].most else min
         extreme = furthest(range(len(classes)), key=lambda i: classes[i][place])
         return f"{base.LETTERS[extreme]}) is the {word}."
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
-        return base.choice_score(question, prediction, read(prediction.outputs[0]), published=True)
+        _, opposite = self.adjective(question, catalogue)
+        return base.choice_score(question, prediction, read(prediction.outputs[0], opposite), published=True)
 
 
 TASK = PropertySuperlativeSelection()

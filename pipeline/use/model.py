@@ -302,11 +302,13 @@ class Octopi:
     def compare(self, a: Video, b: Video, property: str) -> Comparison:
         """Whether the first video is more of a property ("hardness", "harder") than the second, or less ("softer")."""
         known, rising = find_property(self.catalogue, property)
-        question = pc.asked(pc.TEMPLATES[0], known.more if rising else known.less, known.spoken)[self.config.opd]
+        comparative, opposite = (known.more, known.less) if rising else (known.less, known.more)
+        question = pc.asked(pc.TEMPLATES[0], comparative, known.spoken)[self.config.opd]
         answer = self.ask(question, [a, b])
         ruled = self.verdict(question, [a, b])
         notes, heads = (*self.apart(answer, ruled), *self.notes([a, b])), ruled.shown if ruled else ""
-        return Comparison(question=question, answer=answer, choice=pc.read(answer), heads=heads, notes=notes)
+        choice = pc.read(answer, comparative, opposite)
+        return Comparison(question=question, answer=answer, choice=choice, heads=heads, notes=notes)
 
     def rank(self, videos: Video | Sequence[Video], property: str) -> Ranking:
         """Videos by a property, least first: by the heads, and the model's own answer for two or three.
@@ -331,9 +333,9 @@ class Octopi:
         if not self.config.speaks:
             notes.append(MUTE)
         elif len(videos) == 3:
-            superlative = known.most if rising else known.least
+            superlative, opposite = (known.most, known.least) if rising else (known.least, known.most)
             answer = self.ask(pss.asked(pss.TEMPLATES[0], superlative, known.spoken)[self.config.opd], videos)
-            letter = pss.read(answer)
+            letter = pss.read(answer, opposite)
             most = None if letter is None else LETTERS.index(letter)
         elif len(videos) == 2:
             compared = self.compare(videos[0], videos[1], property)

@@ -185,11 +185,11 @@ def test_a_registered_task_is_counted_built_stored_and_graded(monkeypatch: pytes
 def test_a_task_that_reads_too_much_or_too_little_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     with refused("pcc: no task; did you mean pc. name its module in MODULES"):
         check("pcc", CATALOGUE)
-    monkeypatch.setattr(pc, "read", lambda answer: {"yes": "yes"}.get(READ(answer)))
+    monkeypatch.setattr(pc, "read", lambda *said: {"yes": "yes"}.get(READ(*said)))
     with refused("PC: a right answer is graded wrong"):
         check("pc", CATALOGUE)
     # Any "yes" in an answer is read, also in one that says neither.
-    monkeypatch.setattr(pc, "read", lambda answer: READ(answer) or ("yes" if "yes" in answer.lower() else None))
+    monkeypatch.setattr(pc, "read", lambda *said: READ(*said) or ("yes" if "yes" in said[0].lower() else None))
     with refused("PC: a wrong answer is graded right: 'yes or no'"):
         check("pc", CATALOGUE)
 

@@ -174,11 +174,17 @@ UNREAD = {
         Conclusion: ~~Yes~~
         <think>Conclusion: Yes.</think> I cannot tell.
         <think>Conclusion: Yes.
+        Yes, the first object is **harder**.
+        Conclusion: No, the first object is softer.
+        Both objects are similar: the first object is softer.
         """,
     "PSS": """
-        d) is the hardest.
+        d) is the softest.
         a) is the same as b).
-        The hardest is **a)** or **b)**.
+        The softest is **a)** or **b)**.
+        Conclusion: b) is the **hardest**.
+        Option B is clearly the hardest
+        The hardest object is (b).
         Answer: A human cannot tell.
         Conclusion: a) is soft, b) is hard, c) is hard.
         Conclusion: a b)
@@ -205,21 +211,30 @@ READ = {
         \\boxed{Yes}
         In conclusion, yes.
         $\\boxed{\\text{Yes, the first}}$
-        Conclusion: No. Conclusion: Yes, the first object is harder.
+        Conclusion: No. Conclusion: Yes, the first object is softer.
+        Yes, the second object is harder.
+        The first object is harder. Conclusion: Yes, the first object is softer.
+        """,
+    ("PC", "no"): """
+        No, the second object is softer.
+        No, the first object is harder than the second object.
+        No, I cannot say that the first object is softer.
         """,
     ("PC", "same"): "Conclusion: **Both** objects are similar.\nAnswer: both are.",
     ("PSS", "b"): """
-        Conclusion: **b)** is the hardest.
-        Option B is the hardest.
+        Conclusion: **b)** is the softest.
+        Option B is the softest.
         Answer: b
         B.
         \\boxed{b}
         **Conclusion:** b), because a) is soft
-        b is clearly the hardest
+        b is clearly the softest
+        b) is the softest. The hardest is c).
+        Hardness: b) is the hardest. Conclusion: b) is the softest.
         Final answer - B
         The most bumpy one is **b**.
         Conclusion: \\(b\\)
-        \N{FULLWIDTH LATIN SMALL LETTER B}) is the hardest
+        \N{FULLWIDTH LATIN SMALL LETTER B}) is the softest
         """,
     ("PSR", "b"): """
         The most suitable object is (b), because a) is soft.
