@@ -1,7 +1,9 @@
 """Recordings cut into presses: bags of both ROS versions, long videos, folders of pictures."""
 
+import os
 import re
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 from tempfile import mkdtemp
@@ -325,9 +327,11 @@ def test_a_table_says_where_to_cut(tmp_path: Path, pictures: list[np.ndarray], c
     assert [*out.glob(".*")] == [], "no lock is left"
 
 
-def test_presses_are_written_all_or_none(tmp_path: Path, pictures: list[np.ndarray]) -> None:
+def test_presses_are_written_all_or_none(
+    tmp_path: Path, pictures: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """So that who begins anew after an error or a kill has none twice."""
-    calls = iter([LENGTH, TOUCHED[1].start])
+    calls, replace = iter([LENGTH, TOUCHED[1].start, *[LENGTH] * 4]), os.replace
 
     def read() -> Iterator[Shot]:
         end = next(calls)
@@ -338,3 +342,15 @@ def test_presses_are_written_all_or_none(tmp_path: Path, pictures: list[np.ndarr
     with refused("the rest cannot be read"):
         cut(read, "it", tmp_path, "rug")
     assert [*tmp_path.iterdir()] == []
+
+    def killed(source: Path, target: Path) -> None:
+        if target.suffix == ".mp4" and [*tmp_path.glob("rug_*.mp4")]:
+            raise KeyboardInterrupt
+        replace(source, target)
+
+    with monkeypatch.context() as patch, suppress(KeyboardInterrupt):
+        patch.setattr(os, "replace", killed)
+        patch.setattr(Path, "unlink", lambda *_, **__: None)
+        cut(read, "it", tmp_path, "rug")
+    assert len([*tmp_path.glob("rug_*.mp4")]) == 1
+    assert cut(read, "it", tmp_path, "rug") == sorted(tmp_path.glob("*.mp4")) == sorted(tmp_path.glob("rug_[01].mp4"))

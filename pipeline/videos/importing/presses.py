@@ -118,10 +118,13 @@ def cut(
         )
     fps = _rate(name, stamped, received)
     out.mkdir(parents=True, exist_ok=True)
+    rests = [re.fullmatch(rf"\.{re.escape(object_id)}_(\d+)\.\d+\.part\.mp4", path.name) for path in out.iterdir()]
+    # Of a kill while videos get their names, the first one is left unfinished: the others are written again.
+    first = min([first_free(out, object_id), *(int(rest[1]) for rest in rests if rest)])
     remove_rests(out)
     source, position, parts = read(), 0, dict[Path, Path]()
     try:
-        for number, (begin, end) in enumerate(ranges, first_free(out, object_id)):
+        for number, (begin, end) in enumerate(ranges, first):
             path = out / f"{object_id}_{number}.mp4"
             # The suffix says the container, so the unfinished file bears it, too.
             parts[path] = path.with_name(f".{path.stem}.{os.getpid()}.part.mp4")
@@ -139,7 +142,7 @@ def cut(
                 for i in range(begin, end)
             ]
             write_csv(path.with_suffix(".csv"), FrameTime, rows)
-        for path, part in parts.items():  # All at the end: who begins anew after an error has none twice.
+        for path, part in reversed(parts.items()):  # All at the end: who begins anew after an error has none twice.
             os.replace(part, path)
     finally:
         for part in parts.values():
