@@ -88,7 +88,8 @@ def adapt(
         seed: Of the folds that the copy is tested by.
 
     Raises:
-        UserError: for a model with nothing to adapt, too few or unusable videos, or where `to` is there already.
+        UserError: for a model with nothing to adapt or that has met a rated object, too few or unusable videos, or
+            where `to` is there already.
     """
     config = model.config
     if to.exists():
@@ -108,6 +109,11 @@ def adapt(
             log.warning("%s: left out, %s", video.name, video.touch.notes[0])
     if catalogue is not None:
         objects = [name for name, video in zip(objects, encoded, strict=True) if video.touched]
+        if met := sorted({*config.objects} & {*objects}):
+            raise UserError(
+                f"{model.folder}: has met {met[0]}, so it cannot be tested by it; adapt the model that it was made of, "
+                "or leave the object out"
+            )
         if len({*objects}) < 2:
             raise UserError(f"{counted(len({*objects}), 'rated object')} with touches; heads need two, better {MORE}")
     encoded = [video for video in encoded if video.touched]

@@ -79,14 +79,16 @@ def read_anew(rated: Rated, classes: Sequence[int], known: Known, seed: int) -> 
 
     Each object is tested by heads that were fitted without it, in a way that was chosen without it.
     """
-    way = choose(rated, classes, known, seed)
+    many = len({*rated.objects}) >= FOLDS
+    way = choose(rated, classes, known, seed, many)
     videos, frames, _ = rated.clips.shape
     evidence = [np.zeros((videos, count)) for count in classes]
     predicted, usual, halved = (np.zeros_like(rated.labels) for _ in range(3))
     logits = np.zeros((videos, frames, sum(classes)))
     for tested in _held(rated.objects, seed, "tested"):
         others, clips = rated.of(~tested), rated.clips[tested]
-        chosen = choose(others, classes, known, seed)
+        # By the same rule, also where fewer are left without the tested ones: what is tested is what is shipped.
+        chosen = choose(others, classes, known, seed, many)
         heads = fit(others, classes, known, chosen)
         for whole, part in zip(evidence, heads.evidence(clips), strict=True):
             whole[tested] = part
@@ -101,15 +103,15 @@ def read_anew(rated: Rated, classes: Sequence[int], known: Known, seed: int) -> 
     return Reading(found, way, evidence, predicted, logits.reshape(videos * frames, -1), usual, halved)
 
 
-def choose(rated: Rated, classes: Sequence[int], known: Known, seed: int) -> Way:
+def choose(rated: Rated, classes: Sequence[int], known: Known, seed: int, many: bool) -> Way:
     """The way by which objects that are held out have the likeliest classes, each object counted once.
 
-    The share of right answers would be too coarse a measure with few objects. Fewer than `FOLDS` are too few to choose
-    by: the old heads stay where properties are alike, else their logits are read.
+    The share of right answers would be too coarse a measure with few objects. Without `many` (`FOLDS` or more) there
+    are too few to choose by: the old heads stay where properties are alike, else their logits are read.
     """
     ways = [Way.LOGITS, Way.FEATURES, Way.BOTH][: 3 if known.alike else 2]
-    names, place, counts = np.unique(rated.objects, return_inverse=True, return_counts=True)
-    if len(names) < FOLDS:
+    _, place, counts = np.unique(rated.objects, return_inverse=True, return_counts=True)
+    if not many:
         return Way.OLD if known.alike else Way.LOGITS
     missed = np.zeros(len(ways))
     for tested in _held(rated.objects, seed, "way"):
