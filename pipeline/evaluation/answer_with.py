@@ -115,12 +115,11 @@ def instruction(catalogue: Catalogue, shown: Shown, training: Sequence[Question]
     """What stands before a question: what is seen, the properties with their classes, and how an answer is worded.
 
     Examples are the first training questions of the task whose right choices differ, told in words; there are none
-    where it is never trained.
+    where it is never trained. Long dialogues come last, as evaluation has none of them (`questions.two_turns`).
     """
     first: dict[str, Question] = {}
-    for q in training:
-        if q.task == task:
-            first.setdefault(q.gold.choice, q)
+    for q in sorted((q for q in training if q.task == task), key=lambda q: max(len(d.turns) for d in q.dialogues)):
+        first.setdefault(q.gold.choice, q)
     turns = [turn for q in [*first.values()][:EXAMPLES] for d in q.dialogues if d.opd is Opd.ALL for turn in d.turns]
     classes = "; ".join(f"{p.spoken} ({', '.join(p.levels)})" for p in catalogue.properties)
     form = catalogue.language.structured.format(**{p.name: f"<{p.spoken}>" for p in catalogue.properties})

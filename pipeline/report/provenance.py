@@ -15,7 +15,7 @@ import yaml
 
 from pipeline.config import EncoderConfig, Params
 from pipeline.config.params import CONF, PARAMS_FILE, compose
-from pipeline.core.io import ROOT, code_of, sha256, tensor_shapes
+from pipeline.core.io import ROOT, code_of, read_json, sha256, tensor_shapes
 from pipeline.core.layout import SHIPPED
 from pipeline.core.records import Part
 from pipeline.evaluation.intervals import coverage_note
@@ -94,11 +94,17 @@ def provenance(
     }
 
 
-def evaluated(models: Sequence[str]) -> list[dict[str, str]]:
-    """The models of `evaluate.models`: folder, and the hash of config.json, which has those of all other files."""
+def evaluated(models: Sequence[str]) -> list[dict[str, Any]]:
+    """The models of `evaluate.models`: folder, the hash of config.json, which has those of all other files, and whether
+    matching questions tell them what the named objects are like."""
     places = {model: SHIPPED if model == SHIPPED.name else Path(model) for model in models}
     configs = {model: place / "config.json" for model, place in places.items()}
-    return [{"folder": named(m), "sha256": sha256(c) if c.is_file() else "unknown"} for m, c in configs.items()]
+    return [
+        {"folder": named(m), "sha256": sha256(c), "facts": read_json(c)["facts"]}
+        if c.is_file()
+        else {"folder": named(m), "sha256": "unknown"}
+        for m, c in configs.items()
+    ]
 
 
 def beyond_paper(params: Params, conf: Path) -> dict[str, Any]:

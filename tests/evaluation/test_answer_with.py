@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.core.io import read_jsonl, read_table, write_jsonl
-from pipeline.core.records import Opd, Part, Prediction, Question, Turn
+from pipeline.core.records import Dialogue, Opd, Part, Prediction, Question, Turn
 from pipeline.evaluation.answer_with import instruction
 from pipeline.evaluation.pictures import frames
 from pipeline.evaluation.records import GradedVision, Shown
@@ -132,12 +132,17 @@ def test_frames_and_questions_arrive_and_become_report_rows(endpoint: SimpleName
     assert not [f for f in PLACE.iterdir() if KEY.encode() in f.read_bytes()]
 
 
+def twice(dialogue: Dialogue) -> Dialogue:
+    return dialogue.model_copy(update={"turns": 2 * dialogue.turns})
+
+
 def test_examples_are_the_first_of_each_answer_at_most_three(endpoint: SimpleNamespace, catalogue: Catalogue) -> None:
     training = read_jsonl(QUESTIONS / "train.jsonl", Question)
+    longer = [q.model_copy(update={"dialogues": (*map(twice, q.dialogues),)}) for q in training]
     for task, count in {"PC": 3, "PSS": 1, "POM": 3, "PSR": 0}.items():
         first = {q.gold.choice: q for q in reversed(training) if q.task == task}
         chosen = sorted(first.values(), key=training.index)[:count]
-        text = instruction(catalogue, Shown.FRAMES, training, task)
+        text = instruction(catalogue, Shown.FRAMES, [*longer, *training], task)
         replies = [t.assistant for q in chosen for d in q.dialogues if d.opd is Opd.ALL for t in d.turns]
         assert re.findall(r"\nAnswer: (.*?)(?=\nQuestion: |\nNow the)", text, re.DOTALL) == replies
         assert all(f"{p.spoken} ({', '.join(p.levels)})" in text for p in catalogue.properties)

@@ -199,6 +199,7 @@ def test_what_was_found_and_what_it_stands_on() -> None:
     found = {"questions.restate": True, "lora.dropout": 0.0, "language.start": "pipeline/pretrained/octopi-small"}
     folds = {"folds": {"of": 5, "tested": [0, 2], "trained": 0}, "replicates": 2}
     noted = {"settings": "Looked at before.", "facts_told": True, "intervals": "Known to be narrow."}
+    noted["evaluated"] = [{"folder": name, "sha256": "", "facts": name == "like"} for name in ("like", "unlike")]
     text = render_readme(report(rows, effects, beyond_paper=found, **folds, **noted), ["effects.png", "map.png"])
     first, stands_on = text.split("## What the figures stand on")
     assert "in 2 of 3 tasks (OPD, PC) and below it in PSS" in first
@@ -208,6 +209,8 @@ def test_what_was_found_and_what_it_stands_on() -> None:
     told = ("a 2.2 M-parameter Llama, taught by hand", "2 of 5 folds (0, 2)", "Looked at before.", "to be narrow.")
     assert all(fact in stands_on for fact in told)
     assert "**Matching questions** say what the named objects are like" in stands_on
+    assert "**Matching questions** do not say to `unlike`" in stands_on
+    assert "`like`" not in stands_on.split("## Where it comes from")[0]
     assert "questions: `restate=True`; lora: `dropout=0.0`; language: `start=" in stands_on
     assert "sha256 `cccccccccccccccc`" in stands_on
 
