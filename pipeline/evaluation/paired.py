@@ -100,7 +100,7 @@ def sign_flip(values: Values, design: Design) -> float:
     objects all combinations of signs are gone through, beyond that so many are drawn (Phipson and Smyth 2010 for their
     p).
 
-    In simulations at the 5 % level, at most 3 % of comparisons of equally good settings were significant. If
+    In simulations at the 5 % level, at most 5 % of comparisons of equally good settings were significant. If
     differences came only from triples of objects as wholes, it would be 13 %: the test assumes that objects' effects
     add up.
     """
