@@ -132,7 +132,8 @@ def statistics(embeddings: torch.Tensor, index: Sequence[Embedding], training: C
     # A part at a time, as float64 takes three times the room of all of them.
     mean = sum((embeddings[part].double().sum(0) for part in rows.split(ROWS_AT_ONCE)), torch.tensor(0.0)) / len(rows)
     squares = (((embeddings[part].double() - mean) ** 2).sum(0) for part in rows.split(ROWS_AT_ONCE))
-    deviation = (sum(squares, torch.tensor(0.0)) / len(rows)).sqrt()
+    # NumPy's root is exact; that of MKL, which torch takes, depends on the maker of the processor.
+    deviation = torch.from_numpy(np.sqrt((sum(squares, torch.tensor(0.0)) / len(rows)).numpy()))
     return Statistics(mean, torch.where(deviation > 0, deviation, torch.ones_like(deviation)))
 
 

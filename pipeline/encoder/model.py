@@ -151,7 +151,9 @@ def mean_and_deviation(maps: torch.Tensor) -> torch.Tensor:
     variance = (values - mean[..., None]).square().mean(2)
     varies = variance > 0
     # The root's gradient at 0 is infinite, and 0 times infinity is NaN; so constant channels take the root of 1.
-    deviation = torch.where(varies, variance, 1.0).sqrt() * varies
+    known = torch.where(varies, variance, 1.0)
+    # By its inverse: MKL's root, which torch takes, depends on the maker of the processor.
+    deviation = known * known.rsqrt() * varies
     return torch.cat([mean, deviation], dim=1).to(maps.dtype)
 
 

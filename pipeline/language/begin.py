@@ -43,7 +43,7 @@ def begin_with_words(model: OctopiForCausalLM, data: ConversationDataset, catalo
     # and the projection is multiplied by it at the end.
     length = y.square().mean().sqrt()
     projection, drawn = model.connector.projection, torch.Generator().manual_seed(seed)
-    optimizer = torch.optim.AdamW(projection.parameters(), lr=RATE)
+    optimizer = torch.optim.AdamW(projection.parameters(), lr=RATE, fused=True)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, STEPS)
     for _ in range(STEPS):
         rows = torch.randint(len(x), (BATCH,), generator=drawn)

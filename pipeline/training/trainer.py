@@ -88,7 +88,7 @@ class TrainableTrainer(Trainer):
             ]
             # A parameter without a group would stay as it was drawn, and nothing would show.
             assert sum(len(group["params"]) for group in groups) == len(trained), f"rates for {list(self._rates)} alone"
-            # Fused, as the Trainer's own: MKL's roots, which it takes else, depend on the maker of the processor.
+            # Fused, as `training_arguments` has it.
             self.optimizer = torch.optim.AdamW(groups, weight_decay=self.args.weight_decay, fused=True)
         return self.optimizer
 
@@ -213,7 +213,8 @@ def training_arguments(
         "per_device_eval_batch_size": micro,
         "gradient_accumulation_steps": batch // (micro * devices),
         "max_grad_norm": config.max_grad_norm,
-        "optim": "adamw_torch",
+        # Fused: MKL's roots, which AdamW takes else, depend on the maker of the processor.
+        "optim": "adamw_torch_fused",
         "lr_scheduler_type": "cosine",
         "save_strategy": "steps" if runtime.save_steps else "no",
         "save_steps": runtime.save_steps or 500,

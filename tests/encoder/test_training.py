@@ -2,6 +2,7 @@
 
 import itertools
 import random
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.linear_model import LogisticRegression
 from sklearn.preprocessing import StandardScaler
+from torch.utils._python_dispatch import TorchDispatchMode
 from transformers import TrainerCallback
 
 from pipeline.core.layout import PRETRAINED
@@ -24,15 +26,18 @@ from pipeline.encoder.data import ClipDataset, EncoderData, LabelledVideo
 from pipeline.encoder.embed import logits_of, standardize, statistics, union
 from pipeline.encoder.finetune import accuracies, finetune, train_classifier
 from pipeline.encoder.frame_classifier import STRENGTHS, deal
-from pipeline.encoder.model import Heads, PropertyClassifier
+from pipeline.encoder.model import Heads, PropertyClassifier, mean_and_deviation
 from pipeline.encoder.recipes import property_classifier
 from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.scales import compose
 from pipeline.training.embeddings import Statistics
 from pipeline.training.sampling import sample_evaluation, sample_training
 from pipeline.training.trainable import load_trainable, trainable_state
+from pipeline.training.trainer import TrainableTrainer, training_arguments
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
 from pipeline.videos.records import Assignment
+from tests.conftest import ROOT
 from tests.encoder.conftest import Hook, gradient, setting_of
 from tests.encoders import PARTS, config, float64, training, write_frames, write_pretrained
 
@@ -227,6 +232,32 @@ def test_standardized_by_training_frames_alone() -> None:
     np.testing.assert_allclose(done.numpy(), (exact - exact[rows].mean(0)) / deviation, rtol=1e-6)
     raw[[e.row for e in index if e.video_id == "test_0"]] += 5
     assert torch.equal(standardize(raw, statistics(raw, index, {"train_0", "train_1"}))[rows], done[rows])
+
+
+class Operators(TorchDispatchMode):
+    """The names of torch's operators while it is entered."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen = set[str]()
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.seen.add(str(function.overloadpacket))
+        return function(*args, **(kwargs or {}))
+
+
+def test_no_root_is_mkls(tmp_path: Path) -> None:
+    """Which depends on the maker of the processor, also with `kernels: portable`."""
+    line, params = torch.nn.Linear(2, 1), compose("smoke", conf=ROOT / "conf")
+    arguments = training_arguments(tmp_path, params.runtime, 0, params.pretrain, max_steps=1)
+    trainer = TrainableTrainer(model=line, args=arguments, train_dataset=[])
+    line(torch.ones(1, 2)).sum().backward()
+    with Operators() as operators:
+        trainer.create_optimizer().step()
+        statistics(torch.randn(4, 3), indexed(("a", "none", f) for f in range(4)), {"a"})
+        mean_and_deviation(torch.rand(2, 3, 4))
+    assert "aten.rsqrt" in operators.seen
+    assert not {name for name in operators.seen if re.search(r"\bsqrt", name)}
 
 
 def test_a_training_object_gets_logits_of_heads_that_did_not_see_it(catalogue: Catalogue, tmp_path: Path) -> None:
