@@ -118,7 +118,7 @@ def effect_rows(
             beside = {**settings, **other.get((task, measure), {})}
             if measure == TASKS[task].measure and (gap := difference(beside.get(full, {}), beside.get(less, {}))):
                 if less is RULES:
-                    change = ", ".join(filter(None, ("full system - heads and rules", TASKS[task].told)))
+                    change = "full system - heads and rules"
                 elif part == "training":
                     change = f"full system - {less.encoder} rated objects"
                 else:

@@ -197,14 +197,17 @@ def task_title(task: str) -> str:
     return f"{TASKS[task].title} ({task})" if task in TASKS else WORDS["tasks"].get(task, task)
 
 
+def told(task: str) -> str:
+    """What rules on the heads' classes are told of a task's questions, and the language model is not."""
+    return f", {TASKS[task].told}" if task in TASKS and TASKS[task].told else ""
+
+
 def system(row: dict[str, Any]) -> str:
     """A variant by what it leaves out of the full system; another model by its name."""
     task, encoder, touch = row["task"], row["encoder"], row["touch"]
-    # Rules on the heads' classes are told of some questions what the language model is not.
-    told = f", {TASKS[task].told}" if task in TASKS and TASKS[task].told else ""
     others: dict[str, str] = {
         Shown.TOUCH: f"{encoder}, as it is",
-        Shown.CLASSES: f"its heads and rules alone{told}",
+        Shown.CLASSES: f"its heads and rules alone{told(task)}",
         Shown.STANDARDISED: f"{encoder}, embeddings standardised by these videos",
         **{shown: f"{encoder}, {words}" for shown, words in WORDS["shown"].items()},
     }
@@ -215,7 +218,7 @@ def system(row: dict[str, Any]) -> str:
     if task in (HEADS, VALIDATION_HEADS, RECALL):
         return "property heads, no language model"
     if not row["lora"]:
-        return f"heads and rules, no language model{told}"
+        return f"heads and rules, no language model{told(task)}"
     words = [WORDS["lacks"][row[axis]] for axis in FULL if row[axis] in WORDS["lacks"]]
     return ", ".join(words) or "Octopi (full system)"
 
@@ -235,7 +238,7 @@ COLUMNS: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
     "chance": ("Chance %", lambda row: number(row["chance"], scale=100)),
     "unread": ("Unread %", lambda row: number(row["unread"] / row["n"], scale=100)),
     "part": ("Part", itemgetter("part")),
-    "change": ("Change", itemgetter("change")),
+    "change": ("Change", lambda row: row["change"] + (told(row["task"]) if row["part"] == "language" else "")),
     "difference": ("Difference, points [95 %]", difference),
     "p": ("p", lambda row: number(row["p"], 3)),
     "p_holm": ("p, Holm", lambda row: number(row["p_holm"], 3)),
