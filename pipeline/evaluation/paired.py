@@ -30,7 +30,8 @@ POWER, SIZE = 0.8, 0.05
 class Difference:
     """How much more often one setting is right than another, as columns of `EffectRow`; shares from -1 to 1.
 
-    All but the difference is None where the questions cannot show that objects differ.
+    All but the difference is None where the questions cannot show that objects differ, and p alone where they cannot be
+    flipped apart.
     """
 
     difference: float
@@ -93,8 +94,10 @@ def standard_error(values: Values, design: Design) -> tuple[Values, Values, Valu
     return np.sqrt(np.maximum(0.0, (n * square + 2) / (n + 2) - centre**2) / (n + 2)), centre, freedom
 
 
-def sign_flip(values: Values, design: Design) -> float:
+def sign_flip(values: Values, design: Design) -> float | None:
     """Two-sided p of the mean of differences (questions): could they as well have gone the other way?
+
+    None where one sign would flip all: then nothing can be said.
 
     If both settings are equally good, what an object adds to the difference is as likely to be d as -d. Up to 15
     objects all combinations of signs are gone through, beyond that so many are drawn (Phipson and Smyth 2010 for their
@@ -106,7 +109,7 @@ def sign_flip(values: Values, design: Design) -> float:
     """
     parts = flip_units(design) @ values
     if len(parts) < 2:
-        return 1.0
+        return None
 
     def far(signed: Values, axis: int) -> Values:
         # Sums that are equal but for rounding must count as equally far.
