@@ -137,9 +137,11 @@ class Chat:
                 self.say(f"{HELP}\n")
 
     def _check_files(self) -> None:
-        """Raise UserError where a file was recorded anew: earlier answers are about what it held before."""
+        """Raise UserError where a file was recorded anew or is gone: earlier answers are about what it held before."""
         for file, held in self.added.items():
-            if digest(Path(file)) not in (held, ""):
+            if not (now := digest(Path(file))):
+                raise UserError(f"{file} is gone since it was added; put it back, or /reset")
+            if now != held:
                 raise UserError(f"{file} has changed since it was added; name the new one otherwise, or /reset")
 
     def _ask(self, question: str) -> None:

@@ -118,6 +118,10 @@ def test_a_chat_mixes_no_recordings_of_one_name(octopi: Octopi, files: list[Path
     changed = f"{touch} has changed since it was added; name the new one otherwise, or /reset"
     assert [line for line in "".join(said).split("\n") if "changed" in line] == [changed] * 2
     assert f"\n{octopi.ask('{tactile} How soft is it?', files[1:2])}\n(property heads: " in "".join(said)
+    touch.unlink()
+    said.clear()
+    chat.run(["And now?"])
+    assert said == [f"{touch} is gone since it was added; put it back, or /reset\n"]
 
 
 @pytest.fixture
