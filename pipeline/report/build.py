@@ -77,7 +77,7 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
                 c.model_copy(update={"video_id": f"{c.video_id}@{fold}"}) if c.part is Part.VALIDATION else c
                 for c in classified
             ]
-    origin = provenance(params, catalogue, videos, splits, [g.objects for g in graded], root)
+    origin = provenance(params, catalogue, videos, splits, [g.objects for g in graded or vision], root)
     # Without those whose answers are to other questions than today's, which were not graded.
     rated = {(g.model, g.shown) for g in vision}
     sources = vision_models(root / layout.EXTERNAL / params.report_name).values()

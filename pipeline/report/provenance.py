@@ -54,6 +54,8 @@ def provenance(
     """
     rows = "\n".join(video.model_dump_json() for video in videos)
     test = {a.video_id: a.object_id for assignments in splits for a in assignments if a.part is Part.TEST}
+    if not params.ablation.train and params.evaluate.objects == "all":
+        test = {video.video_id: video.object_id for video in videos}
     seeds, split = params.ablation.seeds, params.split
     based = ["language"] if params.ablation.train else []
     if based and reads_weights(params.encoder):

@@ -8,6 +8,7 @@ from typing import Any
 import pandas as pd
 import pytest
 
+from pipeline.core.records import Part
 from pipeline.report import load
 from pipeline.report.build import dataset_frame
 from pipeline.report.load import KEYS, load_report, published, read_frame
@@ -17,6 +18,7 @@ from pipeline.report.tables import FIVE_TASKS, SHIPPED_TABLE, TABLES, headline, 
 from pipeline.scales import compose
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.records import Assignment
 from tests.conftest import ROOT, fake_videos, refused
 from tests.report.conftest import effect, report, score
 
@@ -267,6 +269,18 @@ def test_the_base_encoder_is_what_its_backbones_read(tmp_path: Path, backbone: s
     text = render_readme(said, [])
     assert f"{before}a convolutional network with synthetic pretraining." in text
     assert ("tiny-clip" in text) == ("tiny and random" in text) == ("clip" in backbone)
+
+
+@pytest.mark.parametrize(("wanted", "told"), [("test", 1), ("all", 2)])
+def test_a_report_counts_the_objects_that_trained_models_are_asked_about(
+    catalogue: Catalogue, tmp_path: Path, wanted: str, told: int
+) -> None:
+    (tmp_path / "params.yaml").touch()
+    params = compose("evaluate", [f"evaluate.objects={wanted}"], ROOT / "conf")
+    videos = fake_videos(dict.fromkeys([*catalogue.objects][:2], 3))
+    split = [Assignment(video_id=v.video_id, object_id=v.object_id, part=Part.TEST) for v in videos[:3]]
+    said = provenance(params, catalogue, videos, [split], [], tmp_path)
+    assert (len(said["test_objects"]), said["test_videos"]) == (told, 3 * told)
 
 
 def test_every_setting_that_is_not_papers_is_counted_and_named_in_the_fold() -> None:
