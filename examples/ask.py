@@ -19,6 +19,6 @@ for video in (first, second):
     described = model.describe(video)
     print(video)
     for name, known in described.probabilities.items():
-        print(f"  {name}: {described.levels[name]} ({', '.join(f'{level} {p:.0%}' for level, p in known.items())})")
+        print(f"  {name}: {described.levels[name]} ({', '.join(f'{level} {model.config.share(p)}' for level, p in known.items())})")
     for note in described.notes:
         print(f"  {note}")

@@ -217,6 +217,9 @@ def test_a_plan_needs_nothing_and_writes_nothing(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("pipeline.scales.write_params", lambda *_: 1 / 0)
     monkeypatch.setattr("pipeline.scales.check_inputs", lambda *_: 1 / 0)
     assert "8 variants; nothing is written." in octopi("scale", "paper-13b", "--plan")
+    said = octopi("scale", "evaluate", "--plan")
+    assert "Nothing is trained: " in said
+    assert "lora" not in said
 
 
 def test_few_objects_are_named_before_anything_runs(tmp_path: Path, catalogue: Catalogue) -> None:

@@ -368,12 +368,12 @@ def diff(
 Video = Annotated[str, typer.Argument(help="A video.")]
 Another = Annotated[str, typer.Argument(help="Another one.")]
 Property = Annotated[str, typer.Argument(help="Such as hardness, or softer.")]
-Model = Annotated[str | None, typer.Option(help="Folder, or hf://USER/NAME[@REVISION]; by default the shipped one.")]
+Model = Annotated[str | None, typer.Option(help="Folder or hf://USER/NAME\\[@REVISION]; else the shipped one.")]
 Base = Annotated[
     Path | None, typer.Option(help="Folder of its language model, where no known place has it, or of one like it.")
 ]
 Device = Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")]
-Folder = Annotated[str | None, typer.Argument(help="Folder, or hf://USER/NAME[@REVISION]; by default the shipped one.")]
+Folder = Annotated[str | None, typer.Argument(help="Folder or hf://USER/NAME\\[@REVISION]; else the shipped one.")]
 Memory = Annotated[Path, typer.Option(help="Folder of remembered touches.")]
 TOUCHES = Path("touches")
 

@@ -60,6 +60,9 @@ def costs(params: Params, shapes: Shapes) -> Iterator[str]:
     for seed in params.ablation.seeds if objects else ():
         if said := few(assign_objects(shapes.catalogue, {*objects}, params.split, seed), {*objects}):
             yield f"Objects under seed {seed}: {said}; {MORE}."
+    if not params.ablation.train:
+        yield "Nothing is trained: memory and disk are those of the models in evaluate.models, which are not counted."
+        return
     yield disk(params, shapes, objects, fetched)
     devices, sharded = launched(params.runtime.launcher)
     if shapes.llm is not None and sharded:

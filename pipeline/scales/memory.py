@@ -103,7 +103,12 @@ def features(params: Params, tower: VisionTransformer) -> int:
 
 
 def count(params: Params, shapes: Shapes) -> Iterator[Use]:
-    """The memory of each stage that runs a base model of known shapes; `finetune_encoder` with prompts alone."""
+    """The memory of each stage that runs a base model of known shapes; `finetune_encoder` with prompts alone.
+
+    None where nothing is trained.
+    """
+    if not params.ablation.train:
+        return
     config, tower = params.encoder, shapes.tower
     if tower is not None:
         blocks: Any = layers(tower)

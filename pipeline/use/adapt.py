@@ -24,7 +24,7 @@ from pipeline.training.card import CARD_FILE
 from pipeline.training.embeddings import STATISTICS_FILE, Statistics
 from pipeline.use.encoding import EncodedVideo
 from pipeline.use.few_ratings import Known, Rated, Reading, on_features, read_anew, standardised
-from pipeline.use.folder import CATALOGUE, CONFIG, ENCODER_DIR, FITTED, TRAINED, distance
+from pipeline.use.folder import BASE_DIR, CATALOGUE, CONFIG, ENCODER_DIR, FITTED, TRAINED, distance
 from pipeline.use.model import Octopi
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import list_videos, raise_errors
@@ -122,6 +122,7 @@ def adapt(
     made = _without_ratings(model, encoded) if catalogue is None else _rated(model, encoded, catalogue, objects, seed)
     update: dict[str, Any] = {
         "variant": to.name,
+        "names": "number" if model.numbered else "catalogue",
         "scores": {},
         "temperatures": made.temperatures or config.temperatures,
     }
@@ -133,7 +134,11 @@ def adapt(
         same = [*catalogue.classes.items()] == [*model.catalogue.classes.items()]
         update |= {"speaks": config.speaks and same, "objects": tuple(sorted({*config.objects, *objects}))}
     with atomic_folder(to) as folder:
-        shutil.copytree(model.folder, folder, dirs_exist_ok=True)
+        for name in config.files:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(model.folder / name, folder / name)
+        if (base := model.folder / BASE_DIR).is_dir():
+            shutil.copytree(base, folder / BASE_DIR)
         made.statistics.save(folder / ENCODER_DIR / STATISTICS_FILE)
         if made.changed:
             kept = {n: t for n, t in load_tensors(folder / ENCODER_DIR / TRAINED).items() if not n.startswith("heads.")}
@@ -163,7 +168,8 @@ def _without_ratings(model: Octopi, encoded: Sequence[EncodedVideo]) -> Adapted:
         found = on_features(standardised(linear, clips), clips, classifier.classes, np.zeros(classifier.classes))
         changed = _tensors(found)
         told += " So are the logits of its property heads. It was tested on nothing."
-    return Adapted(changed, statistics, told, {})
+    # Those of the old logits do not hold for the new ones.
+    return Adapted(changed, statistics, told, dict.fromkeys(model.properties, 1.0) if changed else {})
 
 
 def _rated(

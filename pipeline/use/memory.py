@@ -8,10 +8,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from filelock import FileLock
+from pydantic import ValidationError
 
-from pipeline.core.io import read_jsonl, write_jsonl
+from pipeline.core.io import write_jsonl
 from pipeline.core.records import Record
-from pipeline.running.errors import UserError
+from pipeline.running.errors import UserError, first_problem
 
 TOUCHES = "touches.jsonl"
 
@@ -50,8 +52,10 @@ def remember(folder: Path, touch: Remembered) -> int:
     if not touch.name.strip():
         raise UserError("the name is empty; call the object something")
     file = folder / TOUCHES
-    touches = recall(folder, touch.encoder) if file.exists() and file.stat().st_size else []
-    write_jsonl(folder / TOUCHES, [*touches, touch])
+    folder.mkdir(parents=True, exist_ok=True)
+    with FileLock(folder / f".{TOUCHES}.lock"):  # Two at once would lose one.
+        touches = recall(folder, touch.encoder) if file.exists() and file.stat().st_size else []
+        write_jsonl(file, [*touches, touch])
     return len(touches) + 1
 
 
@@ -61,11 +65,16 @@ def recall(folder: Path, encoder: str) -> list[Remembered]:
     Raises:
         UserError: where there is no memory, its file is broken, or another encoder wrote it.
     """
-    touches = read_jsonl(folder / TOUCHES, Remembered) if (folder / TOUCHES).is_file() else []
+    file, touches = folder / TOUCHES, list[Remembered]()
+    for number, line in enumerate(file.read_bytes().splitlines() if file.is_file() else (), 1):
+        try:
+            touches.append(Remembered.model_validate_json(line))
+        except ValidationError as error:
+            raise UserError(f"{file}, line {number}: is no touch ({first_problem(error)}); remove the line") from None
     if not touches:
         raise UserError(f"{folder}: no memory of touches; `octopi remember NAME VIDEO --memory {folder}` begins one")
     if any(touch.encoder != encoder for touch in touches):
-        raise UserError(f"{folder / TOUCHES}: another encoder's; remember its touches anew, in another folder")
+        raise UserError(f"{file}: another encoder's; remember its touches anew, in another folder")
     return touches
 
 

@@ -160,6 +160,11 @@ def test_with_ratings_heads_know_them(octopi: Octopi, catalogue: Catalogue, tmp_
     found = rated_videos([tmp_path / "videos"], more := ratings.model_copy(update={"objects": news}))
     again = adapt(mine, [*found], tmp_path / "again", catalogue=more, objects=[*found.values()])
     assert ("heads alone answer" in again) is other, "a copy of a copy says it, too"
+    assert mine.numbered, "the language model knows no other names, whatever the catalogue has"
+    adapt(mine, VIDEOS, inner := tmp_path / "mine" / "inner")
+    copy, _ = read_folder(inner)
+    assert {f.relative_to(inner).as_posix() for f in inner.rglob("*") if f.is_file()} == {*copy.files, CONFIG}
+    assert (copy.rated, copy.calibrated) == (True, False), "its temperatures were those of other logits"
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -326,7 +327,9 @@ def test_a_remembered_touch_is_recognised_and_told(octopi: Octopi, files: list[P
         assert (found.objects[0].name, found.touches, len(found.objects)) == (name, 3, 3)
         assert found.objects[0].similarity == pytest.approx(1, abs=1e-6)
         assert found.objects[0].classes == tuple(octopi.describe(file, sentence=False).levels.values())
-    assert octopi.remember("my ice", files[1], memory) == 4
+    with ThreadPoolExecutor(4) as pool:
+        counts = pool.map(lambda _: octopi.remember("my ice", files[1], memory), range(4))
+    assert sorted(counts) == [4, 5, 6, 7], "none is lost"
     similar = octopi.recognise(files[0], memory).objects
     assert (similar[0].name, len(similar)) == ("my ice", 3), "an object is named once"
     assert similar[0].similarity == pytest.approx(1, abs=1e-6), "by its nearest touch"
@@ -347,9 +350,10 @@ def test_what_is_no_memory_is_refused_and_stays(octopi: Octopi, files: list[Path
     with refused("press"):
         octopi.remember("nothing", still, memory)
     assert (memory / TOUCHES).read_text() == written
-    (memory / TOUCHES).write_text(written[:-20])
-    with refused("line 1: not a Remembered"):
-        octopi.remember("my millet", files[1], memory)
+    for broken in (written[:-20].encode(), b"\xff" + written.encode()):
+        (memory / TOUCHES).write_bytes(broken)
+        with refused("touches.jsonl, line 1: is no touch .*; remove the line"):
+            octopi.remember("my millet", files[1], memory)
     (memory / TOUCHES).write_text(written.replace('"encoder":"', '"encoder":"another'))
     for call in (lambda: octopi.recognise(files[0], memory), lambda: octopi.remember("a", files[1], memory)):
         with refused("another encoder's"):

@@ -289,13 +289,22 @@ def test_a_video_of_varying_rate_is_cut_by_its_time_stamps(tmp_path: Path) -> No
     assert max(black) < 40 < 215 < min(white)
 
 
-def test_a_table_says_where_to_cut(tmp_path: Path, pictures: list[np.ndarray], catalogue: Catalogue) -> None:
+def test_a_table_says_where_to_cut(
+    tmp_path: Path, pictures: list[np.ndarray], catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def checked(*args: Any, **more: Any) -> list[Path]:
+        there.append(len([*out.glob("*.mp4")]))
+        return cut(*args, **more)
+
+    there: list[int] = []
+    monkeypatch.setattr("pipeline.videos.importing.presses.cut", checked)
     write_film(tmp_path / "long.mp4", pictures, 25.0)
     table, out = tmp_path / "videos.csv", tmp_path / "cut"
     table.write_text(
         "file,object_id,session,begin,end\nlong.mp4,rug,one,,0.4\nlong.mp4,rug,two,1.2,2\nlong.mp4,felt,two,,\n"
     )
     assert "3 videos" in octopi("import", "video", table, "--out", out)
+    assert there == [0] * 3, "a kill before the end leaves none that would come twice"
     lengths = [len(list(decode(out / f"{name}.mp4"))) for name in ("rug_0", "rug_1", "felt_0")]
     assert lengths == [10, 20, LENGTH]
     assert [r.recorded_ns for r in read_csv(out / "rug_1.csv", FrameTime)] == [(30 + i) * STEP_NS for i in range(20)]

@@ -140,6 +140,8 @@ def test_what_is_wrong_is_named_with_its_mend(layout: str, tmp_path: Path) -> No
     refuses("names.csv.* has no task 'press the bell'; correct the line", names=table)
     table.write_text(f"episode,object_id\n0,{'ö' * 76}\n")
     refuses("episode 0: object 'ö{50}' .152 bytes. .*, up to 150 bytes; name it in a CSV", names=table)
+    table.write_text("episode,object_id\n0,rug\n1,mug\n0,mug\n")
+    refuses("names.csv, line 4: episode 0 has an object already; remove one of its lines", names=table)
     video.write_bytes(video.read_bytes()[:-1000])
     refuses(f"{video.name}: (no whole video|lacks) .*; download the dataset again")
     video.unlink()

@@ -149,6 +149,8 @@ def _object_ids(root: Path, found: Sequence[Episode], table: Path | None) -> dic
             named = [e.number for e in found if row[column] == (e.task if column == "task" else str(e.number))]
             if not named:
                 raise UserError(f"{where}: {root} has no {column} {row[column]!r}; correct the line or remove it")
+            if twice := ids.keys() & {*named}:
+                raise UserError(f"{where}: episode {min(twice)} has an object already; remove one of its lines")
             ids |= dict.fromkeys(named, row["object_id"])
         if len(ids) < len(found):
             log.warning("%s: lacks %d of %d episodes, which are left out", table, len(found) - len(ids), len(found))

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import av
 import cv2
@@ -178,19 +179,19 @@ def cut_listed(listed: Path, out: Path, fps: float = 0.0) -> list[Path]:
     """
     _, rows = read_rows(listed, ("file", "object_id"))
     sections = [[_seconds(where, column, row.get(column, "")) for column in SECTION] for where, row in rows]
-    written, lines = list[Path](), list[Row]()
-    try:
+    made, written, lines = list[Path](), list[Path](), list[Row]()
+    remove_rests(out)
+    # All get their names at the end: after an error or a kill all is cut again, and none comes twice.
+    with TemporaryDirectory(dir=out, prefix=".", suffix=f".{os.getpid()}.part") as part:
         for (where, row), (begin, end) in zip(rows, sections, strict=True):
             read = partial(film, listed.parent / row["file"], fps, begin or 0.0, end)
-            written += cut(read, where, out, row["object_id"], whole=True)
-            known = {key: value for key, value in row.items() if key not in SECTION}
-            lines.append(known | {"file": written[-1].name})
+            made += cut(read, where, Path(part), row["object_id"], whole=True)
+        for path, (_, row) in zip(made, rows, strict=True):
+            to = out / f"{row['object_id']}_{first_free(out, row['object_id'])}.mp4"
+            os.replace(path.with_suffix(".csv"), to.with_suffix(".csv"))
+            written.append(path.replace(to))
+            lines.append({key: value for key, value in row.items() if key not in SECTION} | {"file": to.name})
         add_to_list(out, lines)
-    except BaseException:  # The mended table is cut from its beginning.
-        for path in written:
-            path.unlink(missing_ok=True)
-            path.with_suffix(".csv").unlink(missing_ok=True)
-        raise
     return written
 
 
