@@ -28,9 +28,9 @@ def test_the_walk_of_a_new_sensor(tmp_path: Path) -> None:
     (project.folder / "examples" / "new_sensor").symlink_to(EXAMPLES / "new_sensor")
     readme = (EXAMPLES / "new_sensor" / "README.md").read_text(encoding="utf-8")
     blocks = re.findall(r"```sh\n(.*?)```", readme, re.DOTALL)
-    typed = [shlex.split(line) for block in blocks for line in block.splitlines()]
+    typed = [shlex.split(line, comments=True) for block in blocks for line in block.splitlines()]
     last = typed.index(["octopi", "repro"])
-    assert [words[:2] for words in typed[last + 1 :]] == [["octopi", "describe"], ["octopi", "demo"]]
+    assert [words[:2] for words in typed[last + 1 :]] == [["octopi", "adapt"], ["octopi", "describe"]]
     for command in typed[:last]:
         output = project.run(*command)
         if command[1] == "data":
