@@ -18,7 +18,8 @@ print()
 for video in (first, second):
     described = model.describe(video)
     print(video)
-    for name, known in described.probabilities.items():
-        print(f"  {name}: {described.levels[name]} ({', '.join(f'{level} {model.config.share(p)}' for level, p in known.items())})")
+    for name, probabilities in described.probabilities.items():
+        known = ", ".join(f"{level} {model.config.share(p)}" for level, p in probabilities.items())
+        print(f"  {name}: {described.levels[name]} ({known})")
     for note in described.notes:
         print(f"  {note}")

@@ -8,6 +8,7 @@ from fractions import Fraction
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
+from unittest import mock
 
 import av
 import cv2
@@ -329,6 +330,12 @@ def test_a_table_says_where_to_cut(
     with refused("names sections of files, and would be lost; name another --out"):
         octopi("import", "video", table, "--out", tmp_path)
     assert len([*out.glob("*.mp4")]) == 4, "nothing is written where a line is wrong"
+    table.write_text("file,object_id\nlong.mp4,rug\n")
+    with monkeypatch.context() as patch:
+        patch.setattr("pipeline.videos.importing.presses.add_to_list", mock.Mock(side_effect=OSError("full")))
+        with pytest.raises(OSError, match="full"):
+            octopi("import", "video", table, "--out", out)
+    assert len([*out.glob("*.mp4")]) == 4, "nor where the list cannot be written"
     octopi("import", "video", tmp_path / "long.mp4", "--out", out, "--object", "rug", "--whole")
     assert "rug_3.mp4" in [f.relative for f in list_videos(out, catalogue).files], "the list goes on"
     with extending(out), refused("cut: another import writes into it"):

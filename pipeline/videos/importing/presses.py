@@ -186,12 +186,18 @@ def cut_listed(listed: Path, out: Path, fps: float = 0.0) -> list[Path]:
         for (where, row), (begin, end) in zip(rows, sections, strict=True):
             read = partial(film, listed.parent / row["file"], fps, begin or 0.0, end)
             made += cut(read, where, Path(part), row["object_id"], whole=True)
-        for path, (_, row) in zip(made, rows, strict=True):
-            to = out / f"{row['object_id']}_{first_free(out, row['object_id'])}.mp4"
-            os.replace(path.with_suffix(".csv"), to.with_suffix(".csv"))
-            written.append(path.replace(to))
-            lines.append({key: value for key, value in row.items() if key not in SECTION} | {"file": to.name})
-        add_to_list(out, lines)
+        try:
+            for path, (_, row) in zip(made, rows, strict=True):
+                to = out / f"{row['object_id']}_{first_free(out, row['object_id'])}.mp4"
+                os.replace(path.with_suffix(".csv"), to.with_suffix(".csv"))
+                written.append(path.replace(to))
+                lines.append({key: value for key, value in row.items() if key not in SECTION} | {"file": to.name})
+            add_to_list(out, lines)
+        except BaseException:  # A list that cannot be written, as on a full disk.
+            for path in written:
+                path.unlink()
+                path.with_suffix(".csv").unlink()
+            raise
     return written
 
 
