@@ -2,8 +2,10 @@
 
 import re
 import runpy
+import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from functools import reduce
 from hashlib import sha256
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,12 +13,14 @@ from typing import Any, cast
 
 import pytest
 import torch
+import yaml
 from huggingface_hub import metadata_load
 from safetensors.torch import load_file
 from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.config import LANGUAGE_DIR
+from pipeline.config.params import load_params
 from pipeline.core.io import read_json, read_table, write_table
 from pipeline.core.layout import SHIPPED
 from pipeline.core.records import Part
@@ -40,13 +44,15 @@ from tests.conftest import CATALOGUE, ROOT, fake_videos
 
 EXAMPLES = ROOT / "examples"
 LARGEST, RANK, VIDEO = 40e6, 32, 200_000
+RUN = ("params.yaml", "dvc.lock")
+"""Of the run that made it."""
 
 
 def test_it_is_whole_and_small() -> None:
     """`read_folder` compares every file with its hash."""
     config, catalogue = read_folder(SHIPPED)
     files = [f for f in SHIPPED.rglob("*") if f.is_file()]
-    assert {f.relative_to(SHIPPED).as_posix() for f in files} == {*config.files, "config.json", "README.md"}
+    assert {f.relative_to(SHIPPED).as_posix() for f in files} == {*config.files, "config.json", "README.md", *RUN}
     assert sum(f.stat().st_size for f in files) <= LARGEST
     adapter = SHIPPED / LANGUAGE_DIR / "adapter"
     assert read_json(adapter / ADAPTER_CONFIG)["r"] <= RANK
@@ -54,6 +60,22 @@ def test_it_is_whole_and_small() -> None:
     assert catalogue.property_names == ("hardness", "roughness", "bumpiness")
     written = "".join(f.read_text(encoding="utf-8") for f in files if f.suffix in (".md", ".json"))
     assert not re.search(r"[\"'\s(`]/\w+/", written), "no path of a machine"
+
+
+def test_the_documented_command_is_that_of_its_run() -> None:
+    document = (ROOT / "docs" / "use.md").read_text(encoding="utf-8").replace("\\\n", "")
+    (command,) = re.findall(r"^octopi scale (invented .*)$", document, re.MULTILINE)
+    scale, *overrides = shlex.split(command)
+    params = compose(scale, overrides, conf=ROOT / "conf")
+    assert load_params(SHIPPED / RUN[0]) == params
+    config, _ = read_folder(SHIPPED)
+    assert (config.frames, config.encoder, config.language) == (params.frames, params.encoder, params.language)
+    stages = yaml.safe_load((SHIPPED / RUN[1]).read_text(encoding="utf-8"))["stages"]
+    own = yaml.safe_load((SHIPPED / RUN[0]).read_text(encoding="utf-8"))
+    for name, stage in stages.items():
+        for key, value in stage.get("params", {}).get(RUN[0], {}).items():
+            assert reduce(lambda found, part: found[part], key.split("."), own) == value, (name, key)
+    assert {"invent", "pretrain", "finetune_encoder@0", "lora@finetuned-all-0", "package"} <= {*stages}
 
 
 def test_its_figures_are_those_of_its_card() -> None:
