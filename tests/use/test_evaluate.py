@@ -100,44 +100,41 @@ def test_its_figures_are_those_of_its_card() -> None:
             assert f"{100 * model['accuracy']:.1f} % [{100 * model['low']:.1f}, " in on_real_videos(SHIPPED)
 
 
-def test_the_readmes_table_is_that_of_the_report() -> None:
-    """Measured of real videos, trained on others; what never ran is said to have never run."""
-    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
-    never = any("**Never run here**: the paper's own models" in line for line in lines)
-    assert never != any((ROOT / "reports").glob("paper-*/scores.csv"))
-    begin = next(i for i, line in enumerate(lines) if line.startswith("| | Trained on other objects"))
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[begin + 2 : begin + 7]]
+def test_the_documents_tables_are_those_of_the_report() -> None:
+    """README's, by how the model was fitted to real videos, and the learning curve: language model / heads and rules."""
+    readme, data = ((ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "docs/data.md"))
+    assert ("**Never run here**: the paper's own models" in readme) != any(
+        (ROOT / "reports").glob("paper-*/scores.csv")
+    )
     choice = "measure in ['choice', 'combined']"
     found = load_report(ROOT / "reports" / "small-videos").scores.query(f"seed == {ALL_SEEDS!r} and {choice}")
     scores = found[found["opd"].isin(["all", ""])].set_index(["task", "encoder", "lora", "touch"])
     full = "model == '7b' and encoder == 'finetuned' and lora == 'with' and opd == 'all'"
     theirs = published().query(f"{full} and {choice}").set_index("task")["value"]
-    for task, row in zip(("OPD", "PC", "PSS", "POM", "PSR"), rows, strict=True):
-        model, rules = (dict(scores.loc[(task, "finetuned", lora, "real")]) for lora in ("with", ""))
-        told = [f"{100 * model['chance']:.1f}", f"{theirs[task]:.1f}"]
-        assert row[1:] == [measured(model), f"{100 * rules['accuracy']:.1f}", *told]
-        assert task not in row[0], "in words"
 
+    def cell(task: str, rated: int | None) -> str:
+        if rated is None:
+            model, rules = (dict(scores.loc[(task, "finetuned", lora, "real")]) for lora in ("with", ""))
+        else:
+            name = after_ratings(SHIPPED.name, rated)
+            model, rules = (dict(scores.loc[(task, name, "", shown)]) for shown in ("touch", "classes"))
+        return f"{measured(model)} / {100 * rules['accuracy']:.1f}"
 
-def test_the_learning_curve_of_the_documents_is_that_of_the_report() -> None:
-    """By how many objects were rated, what the language model and heads had right of others."""
-    found = load_report(ROOT / "reports" / "evaluate-videos").scores.query(f"seed == {ALL_SEEDS!r}")
-    found = found[found["measure"].isin(["choice", "combined"])].set_index(["encoder", "touch", "task"])
-    lines = []
+    def short(task: str, rated: int | None) -> str:
+        return re.sub(r" \[.*\]", "", cell(task, rated))
+
+    tasks = ("OPD", "PC", "PSS", "POM", "PSR")
     for count in (0, 3, 5, 10, 20, 38):
-        cells = []
-        for task in ("OPD", "PC", "PSS", "POM", "PSR"):
-            name = after_ratings(SHIPPED.name, count)
-            model, rules = (dict(found.loc[(name, shown, task)]) for shown in ("touch", "classes"))
-            said = measured(model) if task == "OPD" else f"{100 * model['accuracy']:.1f}"
-            cells.append(f"{said} / {100 * rules['accuracy']:.1f}")
-        lines.append(f"| {count or 'none'} | {' | '.join(cells)} |")
-    document = (ROOT / "docs" / "data.md").read_text(encoding="utf-8")
-    assert "\n".join(lines) in document
-    trained = load_report(ROOT / "reports" / "small-videos").scores.query(f"seed == {ALL_SEEDS!r} and task == 'OPD'")
-    full = trained.query("measure == 'combined' and encoder == 'finetuned' and lora == 'with' and touch == 'real'")
-    (best,) = full[full["opd"] == "all"]["accuracy"]
-    assert f"describes better than an adapted one, {100 * best:.1f} %" in document
+        cells = (cell if task == "OPD" else short for task in tasks)
+        row = " | ".join(tell(task, count) for tell, task in zip(cells, tasks, strict=True))
+        assert f"\n| {count or 'none'} | {row} |\n" in data
+    lines = readme.partition("\n| | No ratings |")[2].splitlines()[2:7]
+    for task, line in zip(tasks, lines, strict=True):
+        told = [*(short(task, count) for count in (0, 10, 38)), cell(task, None)]
+        chance = scores.loc[(task, "finetuned", "with", "real"), "chance"]
+        told += [f"{100 * chance:.1f}", f"{theirs[task]:.1f}"]
+        assert [part.strip() for part in line.strip("|").split("|")][1:] == told
+        assert task not in line.split("|")[1], "in words"
 
 
 def test_its_llm_is_made_once(
