@@ -31,8 +31,6 @@ class Shown(StrEnum):
     """The run's tactile videos; the models of `evaluate.models` are asked this way."""
     CLASSES = "classes"
     """The classes that such a model's property heads predict; rules answer from them, without a language model."""
-    STANDARDISED = "touch, standardised"
-    """As `TOUCH`, with embeddings standardised over the run's videos (without labels)."""
 
 
 class Graded(Score):

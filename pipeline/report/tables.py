@@ -208,7 +208,6 @@ def system(row: dict[str, Any]) -> str:
     others: dict[str, str] = {
         Shown.TOUCH: f"{encoder}, as it is",
         Shown.CLASSES: f"its heads and rules alone{told(task)}",
-        Shown.STANDARDISED: f"{encoder}, embeddings standardised by these videos",
         **{shown: f"{encoder}, {words}" for shown, words in WORDS["shown"].items()},
     }
     if ADAPTED in encoder:

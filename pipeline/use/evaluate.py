@@ -45,9 +45,8 @@ def answers_about(
 ) -> list[GradedVision]:
     """Ask questions about the videos as `evaluate` has them, and grade the answers and what follows by rule from heads.
 
-    Where embeddings are standardised, real videos are asked about twice: as they are, and standardised by their own
-    mean and deviation, which takes no label. Another sensor shifts and scales embeddings. A model of other properties
-    or classes is asked nothing, since it has no words for these, and neither is one whose heads alone answer.
+    A model of other properties or classes is asked nothing, since it has no words for these, and neither is one whose
+    heads alone answer.
 
     Args:
         parts: The part of the split that each object is in.
@@ -79,8 +78,7 @@ def answers_about(
         asked[params.ablation.seeds[0] + repeat] = [
             q.model_copy(update={"question_id": f"{q.question_id}-{repeat}"}) if repeat else q for q in drawn
         ]
-    standardised = params.data.source == "videos" and octopi.config.encoder.standardize
-    return _graded(octopi, octopi.name, params, catalogue, videos, asked, standardised=standardised)
+    return _graded(octopi, octopi.name, params, catalogue, videos, asked)
 
 
 def check_rated(counts: Sequence[int], splits: Mapping[int, Sequence[Assignment]]) -> None:
@@ -161,15 +159,9 @@ def _graded(
     catalogue: Catalogue,
     videos: Sequence[Video],
     asked: Mapping[int, Sequence[Question]],
-    *,
-    standardised: bool = False,
 ) -> list[GradedVision]:
     """Answers about videos, graded; by the seed under which a report counts them."""
     touches, rows, classified = touched(octopi, catalogue, Path(params.data.dir), videos)
-    ways = {Shown.TOUCH: touches}
-    if standardised:
-        std, mean = torch.std_mean(touches, dim=0, correction=0)
-        ways[Shown.STANDARDISED] = (touches - mean) / torch.where(std > 0, std, 1.0)  # As `adapt` does.
     language, per_video = octopi.config.language, octopi.config.frames.per_video
     if params.kernels == "portable":
         use_onednn(octopi.llm)
@@ -177,11 +169,9 @@ def _graded(
         language = language.model_copy(update={"generation_batch_size": BATCH})
     found = []
     for seed, questions in asked.items():
-        scored = {}
-        for shown, features in ways.items():
-            store = EmbeddingStore().with_rows(rows, features)
-            said = answer(octopi.llm, store, questions, octopi.config.opd, language, per_video)
-            scored[shown] = grade(questions, said, catalogue)
+        store = EmbeddingStore().with_rows(rows, touches)
+        said = answer(octopi.llm, store, questions, octopi.config.opd, language, per_video)
+        scored = {Shown.TOUCH: grade(questions, said, catalogue)}
         if octopi.config.heads:
             scored[Shown.CLASSES] = conclude(questions, classified, catalogue)
         for shown, scores in scored.items():
