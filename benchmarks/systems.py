@@ -13,7 +13,7 @@ from pipeline.config.params import load_params
 from pipeline.core.io import read_csv
 from pipeline.core.layout import SHIPPED
 from pipeline.evaluation.records import Shown
-from pipeline.evaluation.rows import ScoreRow
+from pipeline.evaluation.rows import ALL_SEEDS, ScoreRow
 from pipeline.running.errors import UserError
 from pipeline.use.model import Octopi
 from pipeline.videos.files import video_files
@@ -36,7 +36,8 @@ def measure(root: Path, triples: int = 12, batch: int = 32) -> list[Row]:
     params = load_params(root / "params.yaml")
     file = root / "reports" / params.report_name / "scores.csv"
     scores = read_csv(file, ScoreRow) if file.is_file() else []
-    rows = [r for r in scores if r.encoder == SHIPPED.name and r.task in COMPARING and r.measure == "choice"]
+    scores = [r for r in scores if r.encoder == SHIPPED.name and r.seed == ALL_SEEDS]
+    rows = [r for r in scores if r.task in COMPARING and r.measure == "choice"]
     own = {name: [Error.of(r) for r in rows if r.touch == shown] for name, shown in SHOWN.items()}
     if not all(own.values()):
         raise UserError(f"{file}: has no answers of the shipped model; run `make repro` first")

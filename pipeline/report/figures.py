@@ -6,6 +6,7 @@ Drawn without pyplot (no global state, no window) and saved without dates, so th
 from __future__ import annotations
 
 import itertools
+import textwrap
 from collections.abc import Mapping, Sequence
 
 import pandas as pd
@@ -90,7 +91,7 @@ def draw_effects(effects: pd.DataFrame) -> Figure:
         axes.axvline(0, color=QUIET, linewidth=0.9)
         axes.xaxis.set_major_locator(MaxNLocator(4, prune="both"))
         axes.set(xlim=(-reach, reach), ylim=(-len(labels) + 0.4, 0.6), xlabel="points")
-        axes.set_title(f"{WORDS['parts'].get(part, part)}\n{change}")
+        axes.set_title(f"{WORDS['parts'].get(part, part)}\n{textwrap.fill(change, 36)}")
         axes.set_yticks([-i for i in range(len(labels))], names if number % 4 == 0 else [""] * len(labels))
         axes.grid(axis="x")
     return figure

@@ -1,5 +1,6 @@
 """A whole report from a made-up run: its files, its figures recomputed, runs that lack something, equal bytes."""
 
+import itertools
 import json
 import re
 import shutil
@@ -9,6 +10,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from matplotlib import rc_context
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from safetensors.torch import load_file
 
 from pipeline.config.params import load_params
@@ -18,6 +21,7 @@ from pipeline.encoder.records import Classification
 from pipeline.evaluation.calibration import fit_temperature
 from pipeline.evaluation.records import Graded, GradedVision, Shown
 from pipeline.report.build import MOST_METRICS, finish_report, without_places, write_report
+from pipeline.report.figures import STYLE, draw_effects
 from pipeline.report.load import DATASET, load_report
 from pipeline.report.page import data_tables, write_page
 from pipeline.report.provenance import base_model, digest
@@ -243,3 +247,14 @@ def test_a_run_that_trains_nothing_reports_models_that_were_trained_before(tmp_p
     page = write_page(tmp_path).read_text()
     assert "62.5 [" in page
     assert f'id="{params.report_name}-tasks"' not in page
+
+
+def test_titles_of_effects_lie_in_the_figure_and_not_on_each_other() -> None:
+    effects = load_report(ROOT / "reports" / "small-videos").effects
+    assert effects["change"].str.len().max() > 50, "a long one is among them"
+    with rc_context(STYLE):
+        figure = draw_effects(effects)
+        FigureCanvasAgg(figure).draw()
+    boxes = [axes.title.get_window_extent() for axes in figure.axes]
+    assert all(figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1 and box.y1 <= figure.bbox.y1 for box in boxes)
+    assert not any(one.overlaps(other) for one, other in itertools.combinations(boxes, 2))
