@@ -162,13 +162,21 @@ def _variants(
 
 
 def _committed(store: Store, params: Params, now: int) -> None:
-    """Finished runs of the reports in reports/ that another chain made, one a system: so a clone's table has them."""
-    for table in sorted(REPORTS.glob("*/scores.csv")):
-        report, content = table.parent, digest(table.read_text(encoding="utf-8"))
+    """Finished runs of the reports in reports/ that another chain made, one a system: so a clone's table has them.
+
+    Those of a report that was replaced or removed since are deleted (`mlflow gc` frees their place).
+    """
+    tables = {table.parent: digest(table.read_text(encoding="utf-8")) for table in sorted(REPORTS.glob("*/scores.csv"))}
+    here = {(report.name, content) for report, content in tables.items()}
+    for run in store.find({KIND: "variant"}):
+        tags = run.data.tags
+        if REPORT in tags and (tags[REPORT], tags.get(CONTENT)) not in here:
+            store.client.delete_run(run.info.run_id)
+    for report, content in tables.items():
         if report.name == params.report_name or store.find({REPORT: report.name, CONTENT: content}):
             continue
         own = yaml.safe_load((report / "params.yaml").read_text(encoding="utf-8"))
-        for values, metrics in reported(table).items():
+        for values, metrics in reported(report / "scores.csv").items():
             factors = dict(zip(Variant._fields, values, strict=True))
             # A model that `evaluate` asked has no factors.
             name = f"{report.name}: {'-'.join(values[:3] if factors['lora'] else values[:1])}"

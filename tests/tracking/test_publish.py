@@ -185,6 +185,16 @@ def test_reports_of_other_chains_are_finished_runs_above_a_test_of_the_plumbing(
     chain.ran(["grade"], minutes=60, mark="2")
     publish(chain.params)
     assert len(runs("variant")) == len(found)
+    (other / "scores.csv").write_text(HEADER + SCORES)
+    chain.ran(["grade"], minutes=120, mark="3")
+    publish(chain.params)
+    left = {run.info.run_name: run.info.run_id for run in runs("variant")}
+    assert set(left) - mine == {"real-videos: finetuned-with-all"}, "a system that the new report lacks is gone"
+    assert left["real-videos: finetuned-with-all"] != full.info.run_id, "and what the old one had"
+    shutil.rmtree(other)
+    chain.ran(["grade"], minutes=180, mark="4")
+    publish(chain.params)
+    assert {run.info.run_name for run in runs("variant")} == mine
 
 
 def test_a_clone_that_only_pulled_has_no_stage_runs(chain: FakeChain) -> None:
