@@ -50,7 +50,7 @@ from pipeline.videos.records import Assignment, Probe
 from pipeline.weights.backbones import TIMM_WEIGHTS, backbone_files
 
 LIMITS = (
-    "It knows objects and sensors only as its training videos show them; for another sensor it must be trained anew.",
+    "It knows objects and sensors only as its training videos show them; for another, adapt it or train it anew.",
     "It was asked templates of the tasks above; what it answers to other questions was never measured.",
     "Its probabilities are calibrated on validation objects of the same sensor, and mean little for another.",
     "It does not say that it does not know; heed the notes of `look` and `describe`.",

@@ -13,6 +13,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
+from pipeline.config import TrackingConfig
 from pipeline.core.io import write_table
 from pipeline.evaluation.records import Graded
 from pipeline.scales import write_params
@@ -185,8 +186,13 @@ def test_reports_of_other_chains_are_finished_runs_above_a_test_of_the_plumbing(
     chain.ran(["grade"], minutes=60, mark="2")
     publish(chain.params)
     assert len(runs("variant")) == len(found)
+    shared = f"sqlite:///{Path('shared.db').resolve()}"
+    publish(on_it := chain.params.model_copy(update={"tracking": TrackingConfig(uri=shared)}))
+    before = {run.info.run_id for run in runs("variant", shared)}
     (other / "scores.csv").write_text(HEADER + SCORES)
     chain.ran(["grade"], minutes=120, mark="3")
+    publish(on_it)
+    assert before < {run.info.run_id for run in runs("variant", shared)}, "a server has reports of others, too"
     publish(chain.params)
     left = {run.info.run_name: run.info.run_id for run in runs("variant")}
     assert set(left) - mine == {"real-videos: finetuned-with-all"}, "a system that the new report lacks is gone"
