@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import shutil
 import signal
@@ -125,13 +126,19 @@ def test_a_stage_that_fails_runs_once_and_what_ran_beside_it_is_kept(here: Path)
     assert list(yaml.safe_load((here / "dvc.lock").read_text())["stages"]) == ["good"]
 
 
+SUBREAPER = 36
+"""prctl(2)'s number of what has a process take the orphans of those that it started."""
+
+
 @pytest.mark.skipif(cores() < 2, reason="needs two cores")
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_a_killed_chain_leaves_no_process_of_dvcs_and_goes_on(here: Path, number: signal.Signals) -> None:
-    """As DVC, it leaves the stage, which may be at its end."""
+    """As DVC, it leaves the stage, which may be at its end. Nobody fetches what ended, as in many a container."""
     repository(here, CHAIN)
     (here / "stages").mkdir()
     (here / "stages/slow.py").write_text(f"import time\n{RUNNING}\n")
+    if sys.platform == "linux":
+        assert ctypes.CDLL(None).prctl(SUBREAPER, 1) == 0
     process = launch(here, "octopi", "repro", errors=subprocess.DEVNULL)
     assert process.stdout
     while process.stdout.readline() != "now\n":
@@ -146,6 +153,11 @@ def test_a_killed_chain_leaves_no_process_of_dvcs_and_goes_on(here: Path, number
     subprocess.run(["octopi", "repro"], env=ENVIRONMENT, check=True)
     for left in stage:
         left.kill()
+    if sys.platform == "linux":
+        assert ctypes.CDLL(None).prctl(SUBREAPER, 0) == 0
+        for child in living:
+            with suppress(ChildProcessError):  # Its parent fetched it.
+                os.waitpid(child.pid, 0)
 
 
 @pytest.mark.skipif(cores() < 2, reason="needs two cores")

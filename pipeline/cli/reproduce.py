@@ -14,8 +14,10 @@ from multiprocessing import get_context
 from pathlib import Path
 from shutil import which
 from subprocess import run
+from typing import TYPE_CHECKING
 
 from pipeline.config.params import CHAIN, load_params
+from pipeline.core.io import runs
 from pipeline.core.runtime import cores
 from pipeline.evaluation.records import ADAPTED
 from pipeline.running.errors import UserError
@@ -23,6 +25,9 @@ from pipeline.running.parallel import end_with_parent
 from pipeline.scales.cost import HOURS
 from pipeline.tasks import TASKS
 from pipeline.weights import is_random
+
+if TYPE_CHECKING:
+    from dvc.repo import Repo
 
 INTERRUPTED = ("exited with 130", "exited with -2")
 """How DVC's error ends for a stage that Ctrl-C ended, the second where it had hardly begun or was at its end."""
@@ -47,6 +52,7 @@ def outdated(root: Path) -> tuple[dict[str, list[str]], int, bool]:
 
     try:
         with Repo(str(root)) as repo:
+            _unlock(repo)
             changed, graph = repo.status(targets=[str(CHAIN)]), repo.index.graph
     except SCMError:
         raise UserError(f"{root.resolve()}: no Git repository, which DVC needs; clone it, or `git init`") from None
@@ -62,6 +68,20 @@ def outdated(root: Path) -> tuple[dict[str, list[str]], int, bool]:
     }
     whole = all(Path(out.fs_path).exists() for stage in graph for out in stage.outs)
     return waits, sum(stage.path_in_repo == str(CHAIN) for stage in graph), whole
+
+
+def _unlock(repo: Repo) -> None:
+    """Remove the locks of processes that ended: those that nobody fetches are living ones to DVC, which then refuses.
+
+    Whoever kills `octopi repro` leaves its processes of DVC to the system's first one.
+    """
+    from dvc.fs import localfs
+    from dvc.rwlock import _edit_rwlock
+
+    with _edit_rwlock(repo.tmp_dir, localfs, repo.config["core"].get("hardlink_lock", False)) as locks:
+        written, read = locks["write"], locks["read"]
+        locks["write"] = {path: by for path, by in written.items() if runs(by["pid"])}
+        locks["read"] = {path: left for path, by in read.items() if (left := [one for one in by if runs(one["pid"])])}
 
 
 def side_by_side(waits: Mapping[str, list[str]], at_once: int) -> int:

@@ -55,12 +55,20 @@ def remove_rests(folder: Path) -> None:
             _remove_rest(Path(place, name))
 
 
-def _remove_rest(path: Path) -> None:
-    """Remove a file or folder that is unfinished and whose process has ended."""
+def runs(process: int) -> bool:
+    """Whether a process runs. One that ended keeps its number until it is fetched, which some containers never do."""
     import psutil
 
+    try:
+        return bool(psutil.Process(process).status() != psutil.STATUS_ZOMBIE)
+    except psutil.NoSuchProcess:
+        return False
+
+
+def _remove_rest(path: Path) -> None:
+    """Remove a file or folder that is unfinished and whose process has ended."""
     process = REST.fullmatch(path.name)
-    if process is None or psutil.pid_exists(int(process[1])):
+    if process is None or runs(int(process[1])):
         return
     if path.is_dir():
         shutil.rmtree(path, ignore_errors=True)
