@@ -652,11 +652,13 @@ def studio(
 ) -> None:
     """Show a page for a sensor on the desk: record presses, rate them, adapt the model, ask it. Nothing leaves."""
     from pipeline.use.studio import Studio, serve_studio
+    from pipeline.videos.files import extending
 
     def load(copy: str | None) -> Octopi:
         return _load(copy or model, base, device)
 
-    serve_studio(lambda: Studio(load, folder, camera, times, newest=model is None), port)
+    with extending(folder / "videos"):
+        serve_studio(lambda: Studio(load, folder, camera, times, newest=model is None), port)
 
 
 def _print_notes(notes: Sequence[str], heads: str = "") -> None:

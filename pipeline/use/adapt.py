@@ -49,6 +49,7 @@ class Adapted(NamedTuple):
     told: str
     """What a reader should know of it."""
     temperatures: dict[str, float]
+    """By which the logits of each property are divided for its probabilities; empty where they stay."""
 
 
 def rated_videos(folders: Sequence[Path], catalogue: Catalogue) -> dict[Path, str]:

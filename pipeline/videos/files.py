@@ -99,7 +99,7 @@ def list_videos(folder: Path, catalogue: Catalogue) -> Listing:
 
 @contextmanager
 def extending(folder: Path) -> Iterator[None]:
-    """Let one import at a time add videos to a folder: two would give the same numbers, and lose lines of its list.
+    """Let one import or studio at a time add videos to a folder: two would give the same numbers, and lose lines.
 
     UserError where another one runs, or its videos.csv is unreadable, or a table of sections, which lines would spoil.
     """
@@ -112,7 +112,7 @@ def extending(folder: Path) -> Iterator[None]:
             end.callback(lock.unlink, missing_ok=True)
             yield
     except Timeout:
-        raise UserError(f"{folder}: another import writes into it; wait for it, or name another --out") from None
+        raise UserError(f"{folder}: an import or a studio writes into it; let it end, or name another folder") from None
 
 
 def add_to_list(folder: Path, rows: Sequence[Mapping[str, str]]) -> None:

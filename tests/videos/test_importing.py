@@ -338,9 +338,12 @@ def test_a_table_says_where_to_cut(
     assert len([*out.glob("*.mp4")]) == 4, "nor where the list cannot be written"
     octopi("import", "video", tmp_path / "long.mp4", "--out", out, "--object", "rug", "--whole")
     assert "rug_3.mp4" in [f.relative for f in list_videos(out, catalogue).files], "the list goes on"
-    with extending(out), refused("cut: another import writes into it"):
-        octopi("import", "video", tmp_path / "long.mp4", "--out", out, "--object", "rug", "--whole")
-    assert [*out.glob(".*")] == [], "no lock is left"
+    videos = tmp_path / "lab" / "videos"
+    with extending(videos):
+        for call in (("import", "video", tmp_path / "long.mp4", "--out", videos), ("studio", videos.parent)):
+            with refused("videos: an import or a studio writes into it; let it end"):
+                octopi(*call)
+    assert [*out.glob(".*"), *videos.glob(".*")] == [], "no lock is left"
 
 
 def test_presses_are_written_all_or_none(
