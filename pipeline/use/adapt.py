@@ -15,7 +15,7 @@ import torch
 from pipeline.core.io import atomic_folder, load_tensors, save_tensors, sha256, write_json, write_text
 from pipeline.core.records import Encoder
 from pipeline.encoder.embed import standardize
-from pipeline.encoder.frame_classifier import FittedHeads, JointFrameClassifier
+from pipeline.encoder.frame_classifier import Clips, FittedHeads, JointFrameClassifier
 from pipeline.evaluation.calibration import likeliest_temperature
 from pipeline.evaluation.intervals import accuracy_interval
 from pipeline.running.errors import UserError, counted
@@ -23,7 +23,7 @@ from pipeline.running.progress import track
 from pipeline.training.card import CARD_FILE
 from pipeline.training.embeddings import STATISTICS_FILE, Statistics
 from pipeline.use.encoding import EncodedVideo
-from pipeline.use.few_ratings import Known, Rated, Reading, on_features, read_anew, standardised
+from pipeline.use.few_ratings import Known, Linear, Rated, Reading, on_features, read_anew, standardised
 from pipeline.use.folder import BASE_DIR, CATALOGUE, CONFIG, ENCODER_DIR, FITTED, TRAINED, distance
 from pipeline.use.model import Octopi
 from pipeline.videos.catalogue import Catalogue
@@ -31,6 +31,10 @@ from pipeline.videos.files import list_videos, raise_errors
 from pipeline.videos.split import MORE
 
 log = logging.getLogger(__name__)
+FARTHEST = 1.0
+"""Deviations of the old logits that the mean of a new one may lie from theirs. The logit of a class that no rated
+object has lies farther off than any in training. Its size was chosen by how often the language model then names the
+classes of its heads, on real videos without their labels."""
 
 CARD = """# {name}, fitted to another sensor
 
@@ -81,7 +85,7 @@ def adapt(
 
     Embeddings and the logits of the property heads are standardised by the videos' frames, as another sensor shifts and
     scales them. With ratings the heads are read anew on the frozen encoder (`pipeline.use.few_ratings`). A language
-    model that reads logits is given the new ones on the scale that it learnt; it is not trained.
+    model that reads logits is given the new ones as it learnt to read them (`as_learnt`); it is not trained.
 
     Args:
         catalogue: Ratings of any properties. Where they are not the model's, heads alone answer.
@@ -169,8 +173,33 @@ def _without_ratings(model: Octopi, encoded: Sequence[EncodedVideo]) -> Adapted:
         found = on_features(standardised(linear, clips), clips, classifier.classes, np.zeros(classifier.classes))
         changed = _tensors(found)
         told += " So are the logits of its property heads. It was tested on nothing."
+        if statistics.heads is not None and model.config.speaks:
+            statistics = as_learnt(model.encoder.statistics, found.linear(), clips, classifier.classes)
     # Those of the old logits do not hold for the new ones.
     return Adapted(changed, statistics, told, dict.fromkeys(model.properties, 1.0) if changed else {})
+
+
+def as_learnt(known: Statistics, heads: Linear, clips: Clips, classes: Sequence[int]) -> Statistics:
+    """Have a language model read new heads' logits as it learnt to read those of the old ones.
+
+    It learnt which differences between the logits of a property mean which class. To standardise each logit would
+    change them, so each property has one factor, by which its logits deviate as the old ones do.
+
+    Args:
+        known: Mean and deviation of the old logits.
+        heads: Weights and biases of the new ones.
+        clips: Features of videos that the deviation is measured on, videos x frames x dim.
+        classes: How many each property has.
+    """
+    weights, biases = map(torch.from_numpy, heads)
+    logits = torch.from_numpy(clips).double().flatten(0, 1) @ weights.T + biases
+    std, mean = torch.std_mean(logits, dim=0, correction=0)
+    own, old = (torch.stack([part.norm() for part in each.split([*classes])]) for each in (std, known.scale))
+    # Where all rated objects have one class, its logits are constant.
+    factor = torch.where(own > 1e-6, old / own, 1.0).repeat_interleave(torch.tensor(classes))
+    place = ((mean * factor - known.mean) / known.scale).clamp(-FARTHEST, FARTHEST)
+    scale = known.scale / factor
+    return known._replace(mean=mean - place * scale, scale=scale, heads=(weights, biases))
 
 
 def _rated(
@@ -179,16 +208,13 @@ def _rated(
     """Read the heads anew, and test them on objects that were held out."""
     levels = [len(p.levels) for p in catalogue.properties]
     same = [*catalogue.classes.items()] == [*model.catalogue.classes.items()]
-    labels = np.array([catalogue.labels(o) for o in objects])
-    read = read_anew(Rated(_clips(encoded), labels, np.array(objects)), levels, Known(_linear(model), same), seed)
-    if model.encoder.statistics.heads is None:
+    labels, clips = np.array([catalogue.labels(o) for o in objects]), _clips(encoded)
+    read = read_anew(Rated(clips, labels, np.array(objects)), levels, Known(_linear(model), same), seed)
+    statistics = model.encoder.statistics
+    if statistics.heads is None:
         statistics = _without_ratings(model, encoded).statistics
-    else:
-        # Of objects that the heads did not see, as all later ones are: of their own they are too sure.
-        std, mean = torch.std_mean(torch.from_numpy(read.logits), dim=0, correction=0)
-        weights, biases = map(torch.from_numpy, read.heads.linear())
-        scale = torch.where(std > 0, std, 1.0)
-        statistics = model.encoder.statistics._replace(mean=mean, scale=scale, heads=(weights, biases))
+    elif same:
+        statistics = as_learnt(statistics, read.heads.linear(), clips, levels)
     temperatures = {
         p.name: likeliest_temperature(np.exp(table), labels[:, place], objects)
         for place, (p, table) in enumerate(zip(catalogue.properties, read.evidence, strict=True))
@@ -234,8 +260,8 @@ def _clips(encoded: Sequence[EncodedVideo]) -> np.ndarray:
 
 
 def _linear(model: Octopi) -> tuple[np.ndarray, np.ndarray]:
-    """The logits' linear map: that which the language model reads, or that of the property heads."""
-    if model.encoder.statistics.heads is not None:
+    """The logits' linear map: that which the language model reads, or else that of the property heads."""
+    if model.encoder.statistics.heads is not None and model.config.speaks:
         weights, biases = model.encoder.statistics.heads
         return weights.numpy(), biases.numpy()
     state = {name: t.detach().cpu().double().numpy() for name, t in model.encoder.classifier.state_dict().items()}

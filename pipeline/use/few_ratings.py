@@ -66,8 +66,6 @@ class Reading(NamedTuple):
     evidence: list[Array]
     """Log probabilities, videos x classes of each property."""
     predicted: Labels
-    logits: Array
-    """Frames of all videos x classes of all properties."""
     usual: Labels
     """The most frequent class of each property among the other objects, videos x properties."""
     halved: Labels
@@ -81,10 +79,8 @@ def read_anew(rated: Rated, classes: Sequence[int], known: Known, seed: int) -> 
     """
     many = len({*rated.objects}) >= FOLDS
     way = choose(rated, classes, known, seed, many)
-    videos, frames, _ = rated.clips.shape
-    evidence = [np.zeros((videos, count)) for count in classes]
+    evidence = [np.zeros((len(rated.clips), count)) for count in classes]
     predicted, usual, halved = (np.zeros_like(rated.labels) for _ in range(3))
-    logits = np.zeros((videos, frames, sum(classes)))
     for tested in _held(rated.objects, seed, "tested"):
         others, clips = rated.of(~tested), rated.clips[tested]
         # By the same rule, also where fewer are left without the tested ones: what is tested is what is shipped.
@@ -93,14 +89,12 @@ def read_anew(rated: Rated, classes: Sequence[int], known: Known, seed: int) -> 
         for whole, part in zip(evidence, heads.evidence(clips), strict=True):
             whole[tested] = part
         predicted[tested] = heads.predict(clips)
-        weights, biases = heads.linear()
-        logits[tested] = clips @ weights.T + biases
         _, first = np.unique(others.objects, return_index=True)
         usual[tested] = [np.bincount(column).argmax() for column in others.labels[first].T]
         half = sorted(deal(list(others.objects), 2, derive_seed(seed, "half"))[0])
         halved[tested] = fit(others.of(np.isin(others.objects, half)), classes, known, chosen).predict(clips)
     found = fit(rated, classes, known, way)
-    return Reading(found, way, evidence, predicted, logits.reshape(videos * frames, -1), usual, halved)
+    return Reading(found, way, evidence, predicted, usual, halved)
 
 
 def choose(rated: Rated, classes: Sequence[int], known: Known, seed: int, many: bool) -> Way:

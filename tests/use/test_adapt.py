@@ -8,7 +8,9 @@ import pytest
 import torch
 from scipy.special import log_softmax, logsumexp
 
-from pipeline.use.adapt import adapt, rated_videos
+from pipeline.encoder.embed import standardize
+from pipeline.training.embeddings import Statistics
+from pipeline.use.adapt import adapt, as_learnt, rated_videos
 from pipeline.use.few_ratings import Known, Rated, Way, fit, read_anew, standardised
 from pipeline.use.folder import CONFIG, find_base, read_folder
 from pipeline.use.model import UNRATED, Octopi
@@ -79,6 +81,28 @@ def test_a_constant_logit_tells_nothing_and_breaks_nothing() -> None:
     np.testing.assert_allclose(logits.std(axis=0), [1, 1, 0, 1, 1], atol=1e-6)
 
 
+def test_new_logits_are_read_as_the_old_ones() -> None:
+    """The same differences, but for a class that nobody has, whose logit lies where some did in training."""
+    rng, classes = np.random.default_rng(0), [2, 3, 2]
+    clips = rng.normal(size=(30, 5, 7)).astype(np.float32)
+    known = Statistics(torch.tensor(rng.normal(size=7) / 4), torch.tensor(rng.uniform(1, 2, 7)), "frames")
+    weights, biases = rng.normal(size=(7, 7)), rng.normal(size=7) / 4
+    weights[5:], biases[4], biases[5:] = 0, -10, (0, -10)
+    found = as_learnt(known, (weights, biases), clips, classes)
+    assert found.frames == "frames"
+    seen = standardize(torch.from_numpy(clips.reshape(-1, 7)), found).double()
+    logits = clips.reshape(-1, 7).astype(np.float64) @ weights.T + biases
+    read = (seen * known.scale + known.mean).numpy()
+    for whole, present in ((slice(0, 2), slice(0, 2)), (slice(2, 5), slice(2, 4))):
+        factor = np.sqrt((known.scale[whole] ** 2).mean().item() / logits[:, whole].var(axis=0).mean())
+        np.testing.assert_allclose(read[:, present], factor * logits[:, present], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(seen.mean(0)[[4, 6]], torch.tensor([-1.0, -1.0]).double(), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(seen[:, 5:].std(0, correction=0), torch.zeros(2).double())
+    again = as_learnt(found, (weights, biases), clips, classes)
+    torch.testing.assert_close(again.mean, found.mean)
+    torch.testing.assert_close(again.scale, found.scale)
+
+
 @pytest.fixture(scope="module")
 def octopi() -> Octopi:
     return Octopi.from_pretrained(base=model_folder("smollm2"), dtype="float32")
@@ -90,7 +114,10 @@ def test_without_ratings_embeddings_and_heads_are_standardised(octopi: Octopi, t
     mine = Octopi.from_pretrained(tmp_path / "mine", base=model_folder("smollm2"), dtype="float32")
     before, after = (torch.cat([m.encoder.encode(v).features for v in VIDEOS]).double() for m in (octopi, mine))
     expected = (before - before.mean(0)) / before.std(0, correction=0)
-    torch.testing.assert_close(after, expected, rtol=1e-4, atol=1e-4)
+    _, scale, *_ = known = octopi.encoder.statistics
+    read = (after * scale + known.mean).view(-1, 3, 3)
+    factor = scale.view(3, 3).square().mean(1).sqrt()
+    torch.testing.assert_close(read, expected.view(-1, 3, 3) * factor[:, None], rtol=1e-4, atol=1e-4)
     for place, video in enumerate(VIDEOS):
         logits = expected.view(3, -1, 9)[place].split(3, dim=1)
         found, temperatures = mine.encoder.classify(video).probabilities, mine.config.temperatures.values()
@@ -112,7 +139,7 @@ def test_without_ratings_embeddings_and_heads_are_standardised(octopi: Octopi, t
 @pytest.mark.slow
 @pytest.mark.parametrize("other", [False, True], ids=["its own properties", "others"])
 def test_with_ratings_heads_know_them(octopi: Octopi, catalogue: Catalogue, tmp_path: Path, other: bool) -> None:
-    """The language model reads logits whose mean is 0 over objects that heads did not see, or is not asked."""
+    """The language model reads the new logits, each property's times a factor, as the old ones, or is not asked."""
     ratings = load_catalogue(EXAMPLES / "new_sensor") if other else catalogue
     names = ["foam", "brick", "sandpaper"] if other else ["sponge_soft", "wood_ruler", "rug"]
     (tmp_path / "videos").mkdir()
@@ -139,19 +166,21 @@ def test_with_ratings_heads_know_them(octopi: Octopi, catalogue: Catalogue, tmp_
     if not other:
         # Each object held out once, by heads that are fitted anew without it.
         clips = np.stack([octopi.encoder.encode(video).raw.numpy() for video in found])
-        objects, heads = np.array([*found.values()]), octopi.encoder.statistics.heads
+        objects, (mean, scale, _, heads) = np.array([*found.values()]), octopi.encoder.statistics
         assert heads is not None
         rated = Rated(clips, np.array([ratings.labels(o) for o in objects]), objects)
-        known, right, logits = Known((heads[0].numpy(), heads[1].numpy()), alike=True), [], []
+        known, right = Known((heads[0].numpy(), heads[1].numpy()), alike=True), []
         for name in names:
             there = objects == name
             read = fit(rated.of(~there), [3, 3, 3], known, Way.OLD)
             right.append((read.predict(clips[there]) == rated.labels[there]).all(axis=1))
-            logits.append(clips[there].reshape(-1, clips.shape[2]) @ read.linear()[0].T + read.linear()[1])
         assert f"all properties right in {100 * np.mean(right):.1f} %" in told
-        scaled = mine.encoder.statistics
-        np.testing.assert_allclose(scaled.mean, np.concatenate(logits).mean(axis=0), rtol=1e-4, atol=1e-4)
-        np.testing.assert_allclose(scaled.scale, np.concatenate(logits).std(axis=0), rtol=1e-4, atol=1e-4)
+        weights, biases = fit(rated, [3, 3, 3], known, Way.OLD).linear()
+        logits = (clips.reshape(-1, clips.shape[2]) @ weights.T + biases).reshape(-1, 3, 3)
+        seen = np.concatenate([mine.encoder.encode(video).features.numpy() for video in found])
+        factor = np.sqrt((scale.numpy().reshape(3, 3) ** 2).mean(1) / logits.var(axis=0).mean(1))
+        shown = (seen * scale.numpy() + mean.numpy()).reshape(-1, 3, 3)
+        np.testing.assert_allclose(shown, logits * factor[:, None], rtol=1e-3, atol=1e-3)
     with refused("has met"):
         adapt(mine, [*found], tmp_path / "again", catalogue=ratings, objects=[*found.values()])
     for video in found:
