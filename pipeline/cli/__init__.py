@@ -58,7 +58,7 @@ def scale(
     name: Annotated[
         str,
         typer.Argument(
-            help="smoke, small, invented, finetune, evaluate, paper-7b, paper-13b or rehearsal (or your file in conf/)."
+            help="smoke, small, invented, evaluate, paper-7b, paper-13b or rehearsal (or your file in conf/)."
         ),
     ],
     overrides: Annotated[list[str] | None, typer.Argument(help="key=value, for example split.name=kfold.")] = None,

@@ -30,7 +30,6 @@ HOURS = {
     "smoke": "0.1 on two cores",
     "small": "24 on two cores (estimated)",
     "invented": "24 on two cores (estimated)",
-    "finetune": "1 on two cores with bfloat16",
     "rehearsal": "0.4 on two cores (docs/scale.md)",
 }
 """By scale, with its own settings; measured, where nothing else is said."""

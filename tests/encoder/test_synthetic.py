@@ -256,7 +256,7 @@ def test_the_loss_weighs_standardised_quantities_and_kinds() -> None:
 
 def test_a_run_that_starts_from_a_model_takes_its_backbone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    params = compose("finetune", [f"language.start={SHIPPED}"], conf=ROOT / "conf")
+    params = compose("small", [f"language.start={SHIPPED}"], conf=ROOT / "conf")
     write_params(params)
     script = str(ROOT / "stages" / "pretrain.py")
     made_before = runpy.run_path(script, run_name="__main__")["made_before"]
@@ -267,4 +267,4 @@ def test_a_run_that_starts_from_a_model_takes_its_backbone(tmp_path: Path, monke
     from_it = f"language.start={SHIPPED}"
     others = [(from_it, other) for other in ("pretrain.steps=899", "frames.pixels=96", "frames.fit=crop")]
     for other in (*others, ["language.start=models/other"], ["language.start=''"]):
-        assert made_before(compose("finetune", other, conf=ROOT / "conf")) is None, other
+        assert made_before(compose("small", other, conf=ROOT / "conf")) is None, other

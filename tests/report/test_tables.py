@@ -294,6 +294,6 @@ def test_every_setting_that_is_not_papers_is_counted_and_named_in_the_fold() -> 
     assert (found["questions.plainly"], found["pretrain.steps"], found["align.begin_with_words"]) == (0.7, 1, True)
     assert "encoder.embedding" not in found, "CLIP's alone"
     # The start has its connector; a place of this machine is not told.
-    begun = beyond("finetune", "language.start=/home/me/model")
+    begun = beyond("small", "language.start=/home/me/model", "lora.samples=480")
     assert (begun["language.start"], begun["lora.samples"]) == ("model", 480)
     assert not {"align.begin_with_words", "language.normalize_touch"} & {*begun}

@@ -62,7 +62,8 @@ def test_what_raters_say_is_a_catalogue_that_the_chain_trains_on(tmp_path: Path)
     assert catalogue.objects["object_b"].ratings == ((1, 2), (2,), (1,)), "in the raters' order, what is there"
     assert catalogue.language.dataset == "", "PhysiCLeAR's figures are not for these videos"
     assert [f for f in check_folder(tmp_path, catalogue) if f.severity == "error"] == []
-    check_inputs(compose("finetune", [f"data.dir={data.videos}", f"data.catalogue={data.catalogue}"]))
+    folders = f"data.dir={data.videos}", f"data.catalogue={data.catalogue}"
+    check_inputs(compose("small", ["data.source=videos", *folders]))
     rate(data, "ann", "object_a", hardness=1)
     assert load_catalogue(data.catalogue).labels("object_a") == (2, 2, 1), "who changes her mind is asked once"
 
