@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -130,21 +131,36 @@ SUBREAPER = 36
 """prctl(2)'s number of what has a process take the orphans of those that it started."""
 
 
+@pytest.fixture
+def unreaped() -> Iterator[list[psutil.Process]]:
+    """As in many a container nobody reaps orphans, but for those in this list at the end."""
+    orphans = list[psutil.Process]()
+    if sys.platform == "linux":
+        assert ctypes.CDLL(None).prctl(SUBREAPER, 1) == 0
+    yield orphans
+    if sys.platform == "linux":
+        assert ctypes.CDLL(None).prctl(SUBREAPER, 0) == 0
+        for orphan in orphans:
+            with suppress(ChildProcessError):  # Its parent reaped it.
+                os.waitpid(orphan.pid, 0)
+
+
 @pytest.mark.skipif(cores() < 2, reason="needs two cores")
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_a_killed_chain_leaves_no_process_of_dvcs_and_goes_on(here: Path, number: signal.Signals) -> None:
-    """As DVC, it leaves the stage, which may be at its end. Nobody fetches what ended, as in many a container."""
+def test_a_killed_chain_leaves_no_process_of_dvcs_and_goes_on(
+    here: Path, number: signal.Signals, unreaped: list[psutil.Process]
+) -> None:
+    """As DVC, it leaves the stage, which may be at its end."""
     repository(here, CHAIN)
     (here / "stages").mkdir()
     (here / "stages/slow.py").write_text(f"import time\n{RUNNING}\n")
-    if sys.platform == "linux":
-        assert ctypes.CDLL(None).prctl(SUBREAPER, 1) == 0
     process = launch(here, "octopi", "repro", errors=subprocess.DEVNULL)
     assert process.stdout
     while process.stdout.readline() != "now\n":
         pass
     children = psutil.Process(process.pid).children(recursive=True)
     living = [child for child in children if child.status() != psutil.STATUS_ZOMBIE]
+    unreaped += living
     stage = [child for child in living if "stages/slow.py" in child.cmdline()[-1]]
     process.send_signal(number)
     process.wait()
@@ -153,11 +169,6 @@ def test_a_killed_chain_leaves_no_process_of_dvcs_and_goes_on(here: Path, number
     subprocess.run(["octopi", "repro"], env=ENVIRONMENT, check=True)
     for left in stage:
         left.kill()
-    if sys.platform == "linux":
-        assert ctypes.CDLL(None).prctl(SUBREAPER, 0) == 0
-        for child in living:
-            with suppress(ChildProcessError):  # Its parent fetched it.
-                os.waitpid(child.pid, 0)
 
 
 @pytest.mark.skipif(cores() < 2, reason="needs two cores")

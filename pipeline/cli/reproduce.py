@@ -71,9 +71,9 @@ def outdated(root: Path) -> tuple[dict[str, list[str]], int, bool]:
 
 
 def _unlock(repo: Repo) -> None:
-    """Remove the locks of processes that ended: those that nobody fetches are living ones to DVC, which then refuses.
+    """Remove locks of processes that have ended. To DVC one that nobody has reaped is alive, so it would refuse.
 
-    Whoever kills `octopi repro` leaves its processes of DVC to the system's first one.
+    A killed `octopi repro` leaves its processes of DVC to the first process of a container, and not every one reaps.
     """
     from dvc.fs import localfs
     from dvc.rwlock import _edit_rwlock

@@ -56,11 +56,13 @@ def remove_rests(folder: Path) -> None:
 
 
 def runs(process: int) -> bool:
-    """Whether a process runs. One that ended keeps its number until it is fetched, which some containers never do."""
+    """Whether a process runs. One that ended keeps its number until it is reaped, which some containers never do."""
     import psutil
 
     try:
         return bool(psutil.Process(process).status() != psutil.STATUS_ZOMBIE)
+    except psutil.AccessDenied:  # Another user's.
+        return True
     except psutil.NoSuchProcess:
         return False
 

@@ -32,9 +32,9 @@ from pipeline.videos.split import MORE
 
 log = logging.getLogger(__name__)
 FARTHEST = 1.0
-"""Deviations of the old logits that the mean of a new one may lie from theirs. The logit of a class that no rated
-object has lies farther off than any in training. Its size was chosen by how often the language model then names the
-classes of its heads, on real videos without their labels."""
+"""How far the mean of a new logit may lie from the old one's, in deviations of the old one. That of a class which no
+rated object has would lie farther off than any in training. The limit was chosen by how often the language model then
+names the classes of its heads, on real videos without their labels."""
 
 CARD = """# {name}, fitted to another sensor
 
@@ -83,7 +83,7 @@ def adapt(
 ) -> str:
     """Copy a model's folder for the sensor of these videos, and say what the copy knows.
 
-    Embeddings and the logits of the property heads are standardised by the videos' frames, as another sensor shifts and
+    Embeddings or the logits of the property heads are standardised by the videos' frames, as another sensor shifts and
     scales them. With ratings the heads are read anew on the frozen encoder (`pipeline.use.few_ratings`). A language
     model that reads logits is given the new ones as it learnt to read them (`as_learnt`); it is not trained.
 
@@ -160,21 +160,24 @@ def adapt(
 def _without_ratings(model: Octopi, encoded: Sequence[EncodedVideo]) -> Adapted:
     """Standardise what the language model reads, and the heads' logits, by these videos."""
     statistics, classifier = model.encoder.statistics, model.encoder.classifier
-    told, changed = f"Its embeddings are standardised by {counted(len(encoded), 'video')}, without a label.", {}
-    if model.config.encoder.standardize:
+    clips, changed, what = _clips(encoded), dict[str, torch.Tensor](), list[str]()
+    if statistics.heads is not None and model.config.speaks:
+        classes = [len(p.levels) for p in model.catalogue.properties]
+        statistics = as_learnt(statistics, standardised(_linear(model), clips), clips, classes)
+    elif model.config.encoder.standardize:
+        what = ["embeddings"]
         std, mean = torch.std_mean(torch.cat([video.features for video in encoded]).double(), dim=0, correction=0)
         # The features are standardised already, so the new mean and deviation come on top of the old ones. A dimension
         # that is constant in these frames gives no estimate of its scale, so the old scale stays.
         mean, scale = statistics.mean + mean * statistics.scale, statistics.scale * torch.where(std > 0, std, 1.0)
         statistics = statistics._replace(mean=mean, scale=scale)
     if isinstance(classifier, JointFrameClassifier) and model.config.encoder_used is Encoder.FINETUNED:
-        clips, linear = _clips(encoded), _linear(model)
         # Which classes occur together among the objects of its training says nothing of other objects.
-        found = on_features(standardised(linear, clips), clips, classifier.classes, np.zeros(classifier.classes))
-        changed = _tensors(found)
-        told += " So are the logits of its property heads. It was tested on nothing."
-        if statistics.heads is not None and model.config.speaks:
-            statistics = as_learnt(model.encoder.statistics, found.linear(), clips, classifier.classes)
+        none = np.zeros(classifier.classes)
+        changed = _tensors(on_features(standardised(_linear(model), clips), clips, classifier.classes, none))
+    what += ["logits of its property heads"] if changed or statistics.heads is not None else []
+    told = f"The {' and '.join(what)} are standardised by {counted(len(encoded), 'video')}, without a label. "
+    told += "It was tested on nothing."
     # Those of the old logits do not hold for the new ones.
     return Adapted(changed, statistics, told, dict.fromkeys(model.properties, 1.0) if changed else {})
 
@@ -186,7 +189,7 @@ def as_learnt(known: Statistics, heads: Linear, clips: Clips, classes: Sequence[
     change them, so each property has one factor, by which its logits deviate as the old ones do.
 
     Args:
-        known: Mean and deviation of the old logits.
+        known: Mean and deviation of the old logits, which stay.
         heads: Weights and biases of the new ones.
         clips: Features of videos that the deviation is measured on, videos x frames x dim.
         classes: How many each property has.
@@ -198,8 +201,8 @@ def as_learnt(known: Statistics, heads: Linear, clips: Clips, classes: Sequence[
     # Where all rated objects have one class, its logits are constant.
     factor = torch.where(own > 1e-6, old / own, 1.0).repeat_interleave(torch.tensor(classes))
     place = ((mean * factor - known.mean) / known.scale).clamp(-FARTHEST, FARTHEST)
-    scale = known.scale / factor
-    return known._replace(mean=mean - place * scale, scale=scale, heads=(weights, biases))
+    shown = (weights * factor[:, None], (biases - mean) * factor + known.mean + place * known.scale)
+    return known._replace(heads=shown)
 
 
 def _rated(
@@ -213,7 +216,7 @@ def _rated(
     statistics = model.encoder.statistics
     if statistics.heads is None:
         statistics = _without_ratings(model, encoded).statistics
-    elif same:
+    elif same and model.config.speaks:
         statistics = as_learnt(statistics, read.heads.linear(), clips, levels)
     temperatures = {
         p.name: likeliest_temperature(np.exp(table), labels[:, place], objects)

@@ -105,7 +105,7 @@ def extending(folder: Path) -> Iterator[None]:
     """
     listed, lock = folder / LIST_FILE, folder / ".import.lock"
     if listed.is_file() and {*SECTION} & {*read_rows(listed, ("file", "object_id"))[0]}:
-        raise UserError(f"{listed}: names sections of files, and would be lost; name another --out")
+        raise UserError(f"{listed}: names sections of files, and would be lost; name another folder")
     folder.mkdir(parents=True, exist_ok=True)
     try:
         with FileLock(lock, timeout=0), ExitStack() as end:

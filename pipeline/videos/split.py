@@ -20,7 +20,7 @@ VALIDATION = 8
 """With kfold, one in so many of the objects that are not tested is for validation; a whole fold would leave too few to
 train on."""
 ENOUGH = 10
-"""Rated objects from which `octopi adapt` was measured to describe new ones better than without any (docs/data.md)."""
+"""Rated objects that are recommended at the least (docs/data.md)."""
 MORE = f"{ENOUGH} or more to learn from (docs/data.md, How many objects are enough?)"
 
 

@@ -327,7 +327,7 @@ def test_a_table_says_where_to_cut(
         table.write_text(f"file,object_id,begin\nlong.mp4,{'rug,1' if 'inf' in cells else cells}\nlong.mp4,{cells}\n")
         with refused(told):
             octopi("import", "video", table, "--out", out)
-    with refused("names sections of files, and would be lost; name another --out"):
+    with refused("names sections of files, and would be lost; name another folder"):
         octopi("import", "video", table, "--out", tmp_path)
     assert len([*out.glob("*.mp4")]) == 4, "nothing is written where a line is wrong"
     table.write_text("file,object_id\nlong.mp4,rug\n")
