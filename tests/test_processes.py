@@ -17,12 +17,13 @@ import psutil
 import pytest
 import yaml
 
+from pipeline.cli.reproduce import outdated
 from pipeline.core.io import atomic_folder
 from pipeline.core.runtime import cores
 from pipeline.running.stage import stage
 from pipeline.scales import compose, write_params
 from tests.closure import ROOT
-from tests.conftest import not_utf8, wait_until_ended
+from tests.conftest import not_utf8, refused, wait_until_ended
 from tests.project import ENVIRONMENT as USUAL
 
 ENVIRONMENT = {**USUAL, "SHELL": "/bin/sh"}
@@ -169,6 +170,21 @@ def test_a_killed_chain_leaves_no_process_of_dvcs_and_goes_on(
     subprocess.run(["octopi", "repro"], env=ENVIRONMENT, check=True)
     for left in stage:
         left.kill()
+
+
+@pytest.mark.parametrize(
+    ("name", "half", "line"),
+    [
+        (".dvc/tmp/rwlock", "{", "'.dvc/tmp/rwlock'. JSON structure is corrupted; delete it"),
+        ("dvc.lock", "stages: {", "`git checkout dvc.lock` brings back Git's"),
+    ],
+)
+def test_half_a_file_of_dvcs_is_one_line(here: Path, name: str, half: str, line: str) -> None:
+    """As a kill leaves it in the middle of writing."""
+    repository(here, "stages: {first: {cmd: 'true'}}")
+    (here / name).write_text(half)
+    with refused(line):
+        outdated(here)
 
 
 @pytest.mark.skipif(cores() < 2, reason="needs two cores")

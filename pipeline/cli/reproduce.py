@@ -43,7 +43,7 @@ def outdated(root: Path) -> tuple[dict[str, list[str]], int, bool]:
     A stage runs where its inputs changed, and every stage after it unless its own inputs come out the same.
 
     Raises:
-        UserError: where DVC cannot read its own files: one that is killed while it writes dvc.lock leaves half of it.
+        UserError: where DVC cannot read its own files: one that is killed while it writes a file leaves half of it.
     """
     import networkx as nx
     from dvc.exceptions import DvcException
@@ -57,8 +57,9 @@ def outdated(root: Path) -> tuple[dict[str, list[str]], int, bool]:
     except SCMError:
         raise UserError(f"{root.resolve()}: no Git repository, which DVC needs; clone it, or `git init`") from None
     except DvcException as error:
-        back = "`git checkout dvc.lock` brings back the last one of Git; without one, delete it"
-        raise UserError(f"{' '.join(str(error).split())}; {back if 'dvc.lock' in str(error) else 'mend it'}") from None
+        told = " ".join(str(error).split())
+        mends = {"RWLock": "delete it", "dvc.lock": "`git checkout dvc.lock` brings back Git's; without one, delete it"}
+        raise UserError(f"{told}; {next((mends[name] for name in mends if name in told), 'mend it')}") from None
     started = [stage for stage in graph if stage.addressing in changed]
     waiting = set(started).union(*(nx.ancestors(graph, stage) for stage in started))
     waits = {

@@ -110,7 +110,7 @@ def octopi() -> Octopi:
 
 
 @pytest.mark.slow
-def test_without_ratings_embeddings_and_heads_are_standardised(octopi: Octopi, tmp_path: Path) -> None:
+def test_without_ratings_logits_are_standardised(octopi: Octopi, tmp_path: Path) -> None:
     adapt(octopi, VIDEOS, tmp_path / "mine")
     mine = Octopi.from_pretrained(tmp_path / "mine", base=model_folder("smollm2"), dtype="float32")
     before, after = (torch.cat([m.encoder.encode(v).features for v in VIDEOS]).double() for m in (octopi, mine))
